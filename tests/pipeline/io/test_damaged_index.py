@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sqlite3
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 from mcap.opcode import Opcode
@@ -17,7 +19,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.typesys import Stores, get_typestore
 
 from pipeline.io.readers.container import ChunkedFile
-from pipeline.io.readers.mcap_file import MAGIC, RECORD, McapFile
+from pipeline.io.readers.mcap_file import MAGIC, MESSAGE_HEAD, NOT_FINISHED, RECORD, McapFile
 from pipeline.io.readers.ros_bags import BagFile, BagFolder, Db3File
 from tests.pipeline.io.recordings import START_NS, STEP_NS, drive, write_recording
 
@@ -126,6 +128,31 @@ def test_an_index_that_is_too_large_is_not_read(
         assert times_by_channel(container) == EXPECTED
 
 
+def test_the_index_tells_what_is_lost_in_a_damaged_chunk(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    (at, _), *_others = mcap_of_topics(path)
+    content = bytearray(path.read_bytes())
+    content[at - 3] ^= 0xFF  # the end of the first chunk
+    path.write_bytes(content)
+    losses: dict[str, int] = {}
+    with closing(McapFile(path)) as container:
+        assert [channel.count for channel in container.channels] == [COUNT] * TOPICS
+        found = list(container.messages(range(1, TOPICS + 1), None, losses))
+        assert container.damage == {}
+    assert 0 < len(found) < TOPICS * COUNT
+    assert losses == {container.unreadable: TOPICS * COUNT - len(found)}
+
+
+def test_an_index_of_an_unknown_channel_is_not_used(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    (at, _), *_others = mcap_of_topics(path)
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<H", content, at + RECORD.size, 99)
+    path.write_bytes(content)
+    with closing(McapFile(path)) as container:
+        assert times_by_channel(container) == EXPECTED
+
+
 def test_a_damaged_time_in_an_index_does_not_replace_the_time_of_the_message(tmp_path: Path):
     path = tmp_path / "run.mcap"
     (at, _), *_others = mcap_of_topics(path)
@@ -136,12 +163,25 @@ def test_a_damaged_time_in_an_index_does_not_replace_the_time_of_the_message(tmp
         assert times_by_channel(container) == EXPECTED
 
 
+CHANNEL = struct.pack("<HHI7sI3sI", 1, 0, 7, b"/points", 3, b"cdr", 0)
+
+
+def mcap_record(opcode: int, content: bytes) -> bytes:
+    """A record of an MCAP file."""
+    return RECORD.pack(opcode, len(content)) + content
+
+
+def mcap_message(k: int) -> bytes:
+    """The record of a message with the number k as contents."""
+    stamp_ns = START_NS + k * STEP_NS
+    return mcap_record(Opcode.MESSAGE, MESSAGE_HEAD.pack(1, k, stamp_ns, stamp_ns) + bytes([k]))
+
+
 def test_an_empty_chunk_without_an_index_is_no_damage(tmp_path: Path):
-    channel = struct.pack("<HHI7sI3sI", 1, 0, 7, b"/points", 3, b"cdr", 0)
     packed = zstandard.ZstdCompressor().compress(b"")
     head = struct.pack("<QQQII4sQ", 0, 0, 0, 0, 4, b"zstd", len(packed))
     records = [
-        (Opcode.CHANNEL, channel),
+        (Opcode.CHANNEL, CHANNEL),
         (Opcode.CHUNK, head + packed),
         (Opcode.DATA_END, bytes(4)),
         (Opcode.FOOTER, bytes(20)),
@@ -152,6 +192,47 @@ def test_an_empty_chunk_without_an_index_is_no_damage(tmp_path: Path):
     with closing(McapFile(path)) as container:
         assert list(container.whole_records())
         assert container.damage == {}
+
+
+def test_the_bytes_behind_the_last_whole_record_of_a_cut_recording_are_counted(tmp_path: Path):
+    records = [mcap_record(Opcode.CHANNEL, CHANNEL), *(mcap_message(k) for k in range(2))]
+    content, path = MAGIC + b"".join(records), tmp_path / "run.mcap"
+    ends = len(MAGIC) + np.cumsum([len(record) for record in records])
+    for size in range(ends[0], ends[-1] + 1):
+        path.write_bytes(content[:size])
+        whole = np.count_nonzero(ends <= size)
+        left = size - int(ends[whole - 1])
+        with closing(McapFile(path)) as container:
+            assert container.channels[0].count == whole - 1
+            assert container.damage == (
+                {"bytes at the end of a recording that was cut": left} if left else {NOT_FINISHED: 1}
+            )
+
+
+@pytest.mark.parametrize("pack", ["", "zstd"])
+@pytest.mark.parametrize("checked", [False, True])
+@pytest.mark.parametrize("run", [1, 100, 1 << 20])
+def test_messages_beside_a_chunk_do_not_become_a_part_of_it(
+    pack: str, checked: bool, run: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("pipeline.io.readers.mcap_file.LOOSE_RUN", run)
+    raw = mcap_message(3) + mcap_message(4)
+    packed = zstandard.ZstdCompressor().compress(raw) if pack else raw
+    crc = zlib.crc32(raw) if checked else 0
+    head = struct.pack("<QQQI", 0, 0, len(raw), crc) + struct.pack("<I", len(pack)) + pack.encode()
+    chunk = mcap_record(Opcode.CHUNK, head + struct.pack("<Q", len(packed)) + packed)
+    channel = mcap_record(Opcode.CHANNEL, CHANNEL)
+    content = [
+        *(channel, mcap_message(0), mcap_message(1), channel, mcap_message(2)),
+        *(chunk, mcap_message(5), mcap_message(6), channel, mcap_message(7)),
+        *(mcap_record(Opcode.DATA_END, bytes(4)), mcap_record(Opcode.FOOTER, bytes(20))),
+    ]
+    path, losses = tmp_path / "run.mcap", dict[str, int]()
+    path.write_bytes(MAGIC + b"".join(content) + MAGIC)
+    with closing(McapFile(path)) as container:
+        payloads = [message.payload for message in container.messages({1}, None, losses)]
+        assert payloads == [bytes([k]) for k in range(8)]
+        assert (container.damage, losses) == ({}, {})
 
 
 @pytest.mark.parametrize("number", [1 << 40, -1])
