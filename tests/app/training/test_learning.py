@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from app.cli import main
 from app.dashboard.parameters import ParameterState
-from app.store.forests import FOLDER, LEAST_OTHERS, LEAST_TREES, Forests, name_of
+from app.store.forests import FOLDER, LEAST_OTHERS, LEAST_TREES, PACKAGE, Forests, name_of
 from app.store.records import Author, Content
 from app.store.store import Store
 from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector
@@ -227,6 +227,23 @@ def test_a_kept_forest_is_found_by_its_name_and_says_where_it_comes_from(tmp_pat
     again = Forests(tmp_path)
     assert vote(np.zeros((1, COUNT)), again(name, True))[0].tolist() == LEAF["share"]
     assert seen_by(again.read(name)) == ("abc",)
+
+
+def test_the_provenance_of_a_learned_forest_is_that_of_its_file(tmp_path):
+    learned = {
+        "date": "today",
+        "runs": [{"source": "abc"}, {"source": "def"}],
+        "things": {"TA": 12, "pole": 5},
+    }
+    forests = Forests(tmp_path)
+    name = forests.keep(data(learned=learned))
+    expected = {"name": name, "date": "today", "things": {"TA": 12, "pole": 5}, "runs": 2}
+    assert forests.provenance(name) == expected
+    assert forests.provenance(name) == expected, "also when it is cached"
+    assert forests.provenance(PACKAGE) is None
+    assert forests.provenance("0123456789abcdef") is None
+    forests.keep(data())
+    assert Forests(tmp_path).provenance(name) is None, "a file without provenance"
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
 from app.cli import main
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud, open_source
-from pipeline.io.readers.clouds import open_cloud
+from pipeline.io.readers.clouds import offset_for, open_cloud
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
 from tests.pipeline.inventory.plots import plot, write_las
 
@@ -277,3 +280,18 @@ def test_one_pcd_file_is_a_scan_unless_it_is_called_a_plot(tmp_path, points):
 def test_tables_tell_what_they_hold_before_they_are_read(tmp_path, points):
     table = open_table(write(tmp_path / "c.ply", points))
     assert (table.points, table.names[:3]) == (len(points), ("x", "y", "z"))
+
+
+@given(
+    arrays.arrays(
+        np.float64,
+        3,
+        elements=st.one_of(st.sampled_from([0.0, 999.0, 1000.0, -1000.0, 1230.0]), st.floats(-1e7, 1e7)),
+    )
+)
+def test_large_coordinates_are_reduced_by_whole_hundreds_of_metres(middle):
+    offset = offset_for(middle)
+    small = np.abs(middle) < 1000.0
+    assert (offset[small] == 0.0).all()
+    assert (np.abs(middle - offset)[~small] <= 50.0).all()
+    assert (np.remainder(offset, 100.0) == 0.0).all()

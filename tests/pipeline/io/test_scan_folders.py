@@ -85,6 +85,28 @@ def test_names_may_be_times_and_rows_of_tum_belong_to_them(stem: str, tmp_path: 
     np.testing.assert_allclose([pose.t for pose in poses], [curve(9)[k].t for k in range(0, 8, 2)], atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"{START_S}.8", f"{START_S}.9", f"{START_S + 1}.0", f"{START_S + 1}.1"],
+        ["a1", "b1", "a2", "b3"],
+        ["first", "1", "2", "3"],
+    ],
+    ids=["times", "equal numbers", "one without a number"],
+)
+def test_names_that_do_not_number_the_scans_give_their_order_only(
+    names: list[str], tmp_path: Path, opened: Opened
+):
+    for k, name in enumerate(names):
+        write(tmp_path / f"{name}.npy", k)
+    (tmp_path / "poses.txt").write_text(matrices(curve(4)))
+    records = list(opened(tmp_path).records())
+    poses = [record.T_odom_base for record in records if isinstance(record, Odometry)]
+    scans = [record for record in records if isinstance(record, Scan)]
+    np.testing.assert_allclose([pose.t for pose in poses], [pose.t for pose in curve(4)], atol=1e-9)
+    np.testing.assert_allclose([scan.points for scan in scans], [points(k) for k in range(4)], atol=1e-5)
+
+
 def test_rows_of_tum_give_their_times_to_scans_without_any(tmp_path: Path, opened: Opened):
     for k in range(3):
         write(tmp_path / f"{k:06d}.ply", k)
