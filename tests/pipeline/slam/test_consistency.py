@@ -13,7 +13,7 @@ from pipeline.geometry.gaussian import spread_by_pose
 from pipeline.geometry.poses import Pose2
 from pipeline.slam.frame_uncertainty import FrameUncertainty, at_least, transported_covariance
 from pipeline.tracking import Tracker
-from pipeline.tracking.kalman import split, weight
+from pipeline.tracking.kalman import process_noise, split, transition, weight
 from tests.benchmarks.cases.consistency import Errors, one_run
 from tests.benchmarks.stands import STRAIGHT
 from tests.pipeline.strategies import detections, seeds, track
@@ -63,6 +63,27 @@ def test_without_a_shared_part_it_is_the_kalman_filter(seed):
     np.testing.assert_allclose(result, np.linalg.inv(A + B), atol=1e-9)
     np.testing.assert_allclose(place, np.linalg.solve(A + B, A @ x + B @ z), atol=1e-9)
     np.testing.assert_array_equal(part, 0.0)
+
+
+@given(seeds, st.floats(0.0, 5.0), st.floats(0.0, 1.0))
+def test_a_moving_tree_is_split_at_the_time_of_its_measurement(seed, dt, acceleration):
+    """The weight and the shared part follow from the covariance that F P F^T + Q predicts."""
+    rng = np.random.default_rng(seed)
+    shared, R, B = spd(rng, 2), spd(rng, 2), spd(rng, 2)
+    P = spd(rng, 4)
+    P[:2, :2] += shared
+    states, part = P[None].copy(), shared[None].copy()
+    P2 = split(states, part, np.zeros(1, np.int64), R[None], B[None], np.array([dt]), acceleration)[0]
+    F, Q = transition(dt), process_noise(dt, acceleration)
+    own = (F @ P @ F.T + Q)[:2, :2] - shared
+    w = weight(*(0.5 * np.trace(C) for C in (own, shared, R, B)))
+    np.testing.assert_allclose(P2, R + B / (1.0 - w), rtol=1e-9)
+    P1 = (F @ states[0] @ F.T + Q)[:2, :2]
+    np.testing.assert_allclose(P1, own + shared / w, rtol=1e-9)
+    K = P1 @ np.linalg.inv(P1 + P2)
+    rest = np.eye(2) - K
+    after = rest @ shared @ rest.T / w + K @ B @ K.T / (1.0 - w)
+    np.testing.assert_allclose(part[0], after, rtol=1e-6, atol=1e-9)
 
 
 @given(*[st.floats(1e-4, 1.0)] * 4)
@@ -157,6 +178,21 @@ def test_the_error_of_the_map_at_a_landmark_is_that_of_its_reference_pose(seed):
         wanted = spread_by_pose(position[landmark, None], poses[m], covariances[m])[0]
         np.testing.assert_allclose(found[landmark], wanted, atol=1e-9)
     assert not FrameUncertainty().at_landmarks(birth, position).any()
+
+
+@given(seeds, st.floats(1e-3, 1e3))
+def test_of_landmarks_and_measured_poses_the_better_position_counts_whatever_the_heading(seed, turn):
+    rng = np.random.default_rng(seed)
+    spread, least, by_landmarks = spd(rng, 3), spd(rng, 3), spd(rng, 3)
+    by_landmarks[2] *= turn
+    by_landmarks[:, 2] *= turn
+    state = FrameUncertainty()
+    measured, _ = state.with_measured_pose(spread, MANY, least, None)
+    np.testing.assert_allclose(measured, at_least(spread, least, 4.0 / np.sqrt(MANY)))
+    better = by_landmarks[0, 0] + by_landmarks[1, 1] < measured[0, 0] + measured[1, 1]
+    both, after = state.with_measured_pose(spread, MANY, least, by_landmarks)
+    np.testing.assert_array_equal(both, by_landmarks if better else measured)
+    np.testing.assert_allclose(after.hidden, both - spread)
 
 
 @given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))

@@ -124,6 +124,22 @@ def test_pair_by_pair_is_the_likelihood_of_all_pairs_together(seed):
     assert cost == pytest.approx(y @ np.linalg.solve(S, y) + np.linalg.slogdet(S)[1], rel=0.02, abs=0.2)
 
 
+@pytest.mark.parametrize("scale", [0.02, 50.0])
+@given(seed=seeds)
+def test_the_choice_does_not_depend_on_the_unit_of_length(scale, seed):
+    n, (mu, P, centre, R, mean, covariance, hits, rng) = 4, scene(seed, 4)
+    search = filled((mu, P, centre, R, mean, covariance, hits), n, 4, rng)
+    cost, chosen = searched((mu, P, centre, R, mean, covariance, hits, rng), n, search)
+    unit, squared = np.array([scale, scale, 1.0]), scale * scale
+    scaled = (
+        mu * unit, P * np.outer(unit, unit), centre * scale, R * squared, mean * scale,
+        covariance * squared, hits, rng,
+    )  # fmt: skip
+    cost_scaled, chosen_scaled = searched(scaled, n, search)
+    assert chosen_scaled == chosen
+    assert cost_scaled == pytest.approx(cost + n * np.log(squared**2), abs=1e-6), "log |S| of each detection"
+
+
 @given(seeds)
 def test_many_ambiguous_detections_end_and_are_never_worse_than_no_landmark_at_all(seed):
     given_ = scene(seed, MOST, trees=MOST)

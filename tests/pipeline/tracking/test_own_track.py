@@ -10,10 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import preset
+from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import REACH, _best_first
 from pipeline.tracking.track_table import TrackTable
+from pipeline.tracking.tracker import COLUMN_SIGMA
 from pipeline.types.records import RING_FAR, Verdict
+from tests.pipeline.strategies import detections, track
 from tests.pipeline.tracking.test_round_fit_override import PLACE, column
 
 FOREST = preset("forest")
@@ -62,6 +65,24 @@ def test_the_stem_in_the_surroundings_is_the_one_with_most_detections():
 @pytest.mark.parametrize("stem", [(RING_FAR + 0.01, 50), (0.6, ENOUGH - 1)], ids=["too far", "too few"])
 def test_a_column_without_a_detected_stem_in_its_surroundings_begins_a_track(stem):
     assert told(stem)[1:] == [Verdict.TREE]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_track_of_a_column_has_the_covariance_of_the_axis_and_of_the_pose(seed):
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(3, 3)) * [[0.3], [0.2], [0.05]]
+    pose, of_pose = Pose2(*rng.uniform(-2.0, 2.0, 3)), A @ A.T
+    tracker = Tracker(FOREST.tracking)
+    track(tracker, 0, pose, of_pose, detections([]))
+    tracker.classify(1, column(Verdict.TREE, tree=0.8), FOREST.classification)
+    x, y = PLACE - [pose.x, pose.y]
+    J = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
+    shared = J @ of_pose @ J.T
+    np.testing.assert_allclose(tracker.tracks.x[:, :2], [PLACE])
+    np.testing.assert_allclose(tracker.tracks.shared, [shared], atol=1e-12)
+    np.testing.assert_allclose(
+        tracker.tracks.P[:, :2, :2], [np.diag([COLUMN_SIGMA**2] * 2) + shared], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("kind", [Verdict.POLE, Verdict.PERSON, Verdict.MOVING, Verdict.TOO_LOW])
