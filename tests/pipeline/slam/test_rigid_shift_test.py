@@ -12,7 +12,15 @@ from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam.motion import Noise, OdometryTrust
 from pipeline.slam.rigid_shift_test import AGREE, FEWEST, MANY, SEVERAL, estimate_rigid_shift
-from pipeline.slam.slip_detection import SLIPPED, STUCK, UNSURE, motion_by_trees, slip_message
+from pipeline.slam.slip_detection import (
+    FITTED,
+    OWN,
+    SLIPPED,
+    STUCK,
+    UNSURE,
+    motion_by_trees,
+    slip_message,
+)
 from tests.pipeline.strategies import seeds
 
 SIGMA = 0.03
@@ -211,6 +219,35 @@ def test_the_motion_of_stuck_wheels_is_recovered_at_any_distance(true, before):
     assert slip_message(np.zeros(3), result.slipped, False) == STUCK
     assert slip_message(np.array([0.1, 0.0, 0.0]), result.slipped, False) == SLIPPED
     assert slip_message(np.zeros(3), False, False) == ""
+
+
+@pytest.mark.parametrize("bearing", [0.0, np.pi / 2, np.pi, -np.pi / 2])
+def test_the_covariance_of_a_motion_by_trees_is_that_of_least_squares(bearing):
+    """Trees on one side, as by their bearing: their distance makes the position across it uncertain."""
+    rows = np.stack(np.meshgrid([8.0, 11.0, 14.0, 17.0], [-3.0, 0.0, 3.0]), axis=-1).reshape(-1, 2)
+    seen = Pose2(0.0, 0.0, bearing).apply(rows)
+    result = tree_motion([0.0, 0.0, 0.0], Pose2(0.2, 0.3).apply(seen), seen)
+    J = np.zeros((len(seen), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = -seen[:, 1], seen[:, 0]
+    C = np.linalg.inv(np.einsum("nij,nik->jk", J, J) / (2.0 * SIGMA**2))
+    position, heading = max(C[0, 0], C[1, 1]), C[2, 2]
+    assert result.slipped
+    np.testing.assert_allclose(
+        result.covariance, np.diag(FITTED**2 + OWN**2 * np.array([position, position, heading])), rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("turn", [0.1, -0.1])
+@pytest.mark.parametrize("yaw", [np.pi - 0.05, -np.pi + 0.05, np.pi / 2])
+def test_a_motion_by_trees_does_not_depend_on_the_frame_of_the_map(yaw, turn):
+    known, _ = scene(7)
+    seen = Pose2(0.3, 0.1, turn + 0.02).inverse().apply(known)
+    here = tree_motion([0.0, 0.0, turn], known, seen)
+    there = tree_motion([0.0, 0.0, turn], known, seen, before=(4.0, -7.0, yaw))
+    assert here.slipped
+    assert there.slipped
+    np.testing.assert_allclose(there.motion, here.motion, atol=1e-9)
 
 
 def test_matching_trees_reduce_the_covariance_of_a_doubtful_motion():
