@@ -642,3 +642,19 @@ def test_a_placed_filter_begins_a_new_step_and_keeps_the_driven_distance():
     slam.place(2, Pose2(5.0, 0.0, 0.0), np.eye(3) * 1e-4)
     assert slam.state.since_update == 0.0
     assert slam.state.distance == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("scans", [0, 2])
+def test_after_placing_the_motion_since_the_keyframe_is_that_since_the_pose(scans):
+    """With and without a graph: what was driven before is no part of the next keyframe."""
+    slam, step = fresh(keyframe_distance=9.0), Pose2(0.4, 0.1, 0.2)
+    for k in range(scans):
+        slam.process(k, Pose2(0.3 * k), seen_from(Pose2(0.3 * k)), ALL_FREE)
+    assert bool(slam.state.graph.keyframes) == bool(slam.state.keyframe_motion.any()) == (scans > 0)
+    slam.place(scans, Pose2(5.0, 0.0, 1.0), np.eye(3) * 1e-4)
+    np.testing.assert_array_equal(slam.state.keyframe_motion, np.zeros(3))
+    np.testing.assert_array_equal(slam.state.keyframe_covariance, np.zeros((3, 3)))
+    if scans:  # without a graph, the next scan is the first keyframe
+        slam.process(scans, step, detections(TREES[:0]), NOTHING_SEEN)
+        np.testing.assert_allclose(slam.state.keyframe_motion, step.as_array(), atol=1e-12)
+        np.testing.assert_allclose(slam.state.keyframe_covariance, _noise(step, FOREST), atol=1e-12)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 
 from pipeline.config import preset
+from pipeline.geometry.pose_arrays import composed
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam import FastSlam, Motion
 from pipeline.slam.measured_pose import MeasuredPose, SharedErrors, correct_by_measured, update_shared_errors
@@ -141,6 +144,26 @@ def test_the_update_of_a_particle_equals_the_joint_gaussian(seed):
     gain = after[3:, :3] @ np.linalg.inv(after[:3, :3])
     np.testing.assert_allclose(measured.mean[0], mean[3:] + gain @ (x - mean[:3]), atol=1e-6)
     np.testing.assert_allclose(measured.covariance[0], after[3:, 3:] - gain @ after[:3, 3:], atol=1e-6)
+
+
+@given(seeds)
+def test_a_motion_moves_the_joint_covariance_by_the_jacobians_of_the_composition(seed):
+    rng = np.random.default_rng(seed)
+    at, step, Q = rng.uniform(-1.0, 1.0, 3), rng.uniform(-1.0, 1.0, 3), spd(rng, 3)
+    joint, by_trees = spd(rng, 3 + SOURCES * SHARED), spd(rng, 3)
+    begun = replace(SharedErrors.begun_at(2, at, np.eye(3)), joint=joint, by_trees=by_trees)
+    moved = begun.moved(step, Q)
+    wanted = composed(at[None], step[None])[0]
+    h = 1e-6 * np.eye(3)
+    F = np.stack([composed((at + d)[None], step[None])[0] - wanted for d in h], axis=1) / 1e-6
+    G = np.stack([composed(at[None], (step + d)[None])[0] - wanted for d in h], axis=1) / 1e-6
+    J = np.eye(len(joint))
+    J[:3, :3] = F
+    after = J @ joint @ J.T
+    after[:3, :3] += G @ Q @ G.T
+    np.testing.assert_allclose(moved.at, wanted, atol=1e-12)
+    np.testing.assert_allclose(moved.joint, after, atol=1e-3)
+    np.testing.assert_allclose(moved.by_trees, F @ by_trees @ F.T + G @ Q @ G.T, atol=1e-3)
 
 
 @given(seeds)
