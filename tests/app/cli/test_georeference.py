@@ -198,13 +198,13 @@ def test_removing_makes_the_map_local(run, capsys):
     stemmap(capsys, "georeference", run).refused(1, "georeference.json is damaged")
 
 
-def test_a_file_with_an_unknown_system_is_damaged(run, tmp_path, capsys):
+def test_an_unknown_reference_system_is_named(run, tmp_path, capsys):
     stemmap(capsys, "georeference", run, "--by-hand", "500000,5300000,0", "--crs", "EPSG:25832")
     file = run / "georeference.json"
     file.write_text(file.read_text().replace("EPSG:25832", "EPSG:1"))
     for suffix in ("gpkg", "geojson", "laz"):
         result = stemmap(capsys, "export", run, "--to", tmp_path / f"trees.{suffix}")
-        result.refused(1, "georeference.json is damaged")
+        result.refused(1, "does not know the reference system of georeference.json")
 
 
 def test_a_projected_system_with_heights_is_projected():
