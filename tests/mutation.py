@@ -34,7 +34,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import accumulate, pairwise
+from itertools import accumulate, count, pairwise
 from pathlib import Path
 
 from _pytest.config import default_plugins
@@ -44,6 +44,7 @@ _LIMIT_S = 900.0
 #: Time for the start of pytest with a generated mutant; a test that waits for ever takes no computing time.
 _START_S = 120.0
 _KILLED = ("killed", "timeout")
+_NUMBERS = count(1)  # times of files with a mutant [s]
 #: Exit code of a run whose test computes too long; those of pytest are 0 to 5.
 TIMEOUT = 9
 #: Computing time of a test or its fixtures, while lines are recorded and with a generated mutant; sum of the
@@ -501,11 +502,16 @@ def _outcome(mutant: Mutant, tree: Path, lines: Coverage) -> str:
         return "not applicable"
     elif _exit_code_unchanged(tests, tree, tests in _WITH_NUMBA) != 0:
         return "its tests do not pass without it"
+    times = file.stat()
     file.write_bytes(text[:at] + mutant.new.encode() + text[at + len(old) :])
+    os.utime(
+        file, (number := next(_NUMBERS), number)
+    )  # else its byte code may count as that of another state
     try:
         code = _exit_code(tests, tree, tests in _WITH_NUMBA, limit_s, test_limit_s)
     finally:
         file.write_bytes(text)
+        os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
     if code == 4 and _exit_code(f"{tests} --collect-only", tree) == 0:
         return "killed"  # the module of a test cannot be imported
     return {0: "survived", 1: "killed", 2: "killed", TIMEOUT: "timeout"}.get(code, f"pytest ends with {code}")
