@@ -241,7 +241,8 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
     if writer is None:
         raise StemmapError(
             f"{file.name!r} has an unknown format",
-            remedy=f"Formats: {', '.join([*WRITERS, '.laz'])}, or tree-manager",
+            remedy=f"Formats: {', '.join([*WRITERS, '.laz'])}, or tree-manager. "
+            "Tables (.csv) are in the folder of the run.",
         )
     with _WRITING, TemporaryDirectory(prefix=".export-", dir=file.parent) as folder:
         writer(run, FilePath(folder) / file.name)
