@@ -568,19 +568,18 @@ class RobotWatch:
         """Add the robots of the router every 0.5 s until the task is cancelled. `notice` has the reason why a
         robot cannot be added, which is logged once. Without such a reason, while the fleet is empty, it has
         the problem of the link, or that no robot is announced."""
-        failed: dict[str, str] = {}
+        logged: set[str] = set()
         own = ""  # the last notice of this task
         while True:
+            now = ""
             for robot in self._link.robots():
                 try:
                     self.take(robot)
                 except Exception as error:  # the other robots are still to be added
-                    if robot not in failed:
+                    if robot not in logged:
                         _log.exception("the robot %r could not be added", robot)
-                    failed[robot] = f"{robot or NAMELESS} cannot be shown: {error}"
-                else:
-                    failed.pop(robot, None)
-            now = next(iter(failed.values()), "")
+                    logged.add(robot)
+                    now = now or f"{robot or NAMELESS} cannot be shown: {error}"
             if not now and not self._fleet.members:
                 now = self._link.problem or f"Waiting: no robot is announced at {self._address.endpoint}"
             if now:

@@ -141,7 +141,7 @@ def _transformed_points(
             _deskew_block(u, v, dt, sensor, twist)
         for i in range(m):
             kept[n, 0], kept[n, 1], kept[n, 2] = u[i], v[i], w[i]
-            n += np.int64(inside[i])  # without numba, a uint8 would make n one
+            n += np.int64(inside[i])  # NumPy alone would keep the sum in a uint8
     return kept[:n].copy()
 
 

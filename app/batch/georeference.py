@@ -300,7 +300,8 @@ def read_map_frame(folder: FilePath) -> MapFrame:
     known reference system, else the local one.
 
     Raises:
-        SourceError: run.json is missing, or a file is damaged, as by an unknown reference system.
+        SourceError: run.json is missing, a file is damaged, or the reference system of georeference.json is
+            unknown to PROJ.
     """
     import pyproj
 

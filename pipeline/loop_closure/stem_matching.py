@@ -3,7 +3,7 @@ covariance, or the reason of a refusal.
 
 Hypotheses of a pose align each pair of local stems with each pair of the map of equal length; the pairs of
 the map are sorted by length. Each hypothesis is verified by the number of other stems that find a partner.
-The search tries all pairs, so that the second best pose is known as well.
+The search covers the whole map, so that the second best pose is known as well.
 
 A wrong loop ruins a map, a missed one costs little. A pose is accepted only if (1) enough stems agree, (2) so
 many would not agree by chance, by the number of false alarms of the a contrario method (Desolneux, Moisan,
@@ -28,8 +28,9 @@ KEPT = 48  # hypotheses that are refined
 MOST_CELLS = 1_000_000
 BINS = 256  # bins of the lengths of pairs, by which the longest are omitted if there are too many
 DBH_SLACK = 0.05  # m; difference of diameters by another height, season or instrument
-NEIGHBOURS = 12  # local stems next to a base pair that are compared first
-NEIGHBOURS_LEAST = 3  # of them agree; half of the share AGREEING, with which a true pose has fewer in 8 %
+#: Number of local stems nearest to a base pair that are compared first, and how many of them must agree. With
+#: the share AGREEING, fewer than 3 of 12 agree at a true pose in 8 % of the cases; other pairs find it then.
+NEIGHBOURS, NEIGHBOURS_LEAST = 12, 3
 
 
 @compiled

@@ -44,9 +44,20 @@ VIEWS_MAX = 256
 MARGINALS = 16  # keyframes whose covariance is computed; it is interpolated in between
 
 
-Places = tuple[Int, Int, Int, Int, Int]
-"""First unknown in the reduced matrix of each pose, int64, shape (K,), and of each stem that remains, -1 for
-others, shape (L,); `first`, `width` and `offset` of its envelope."""
+class Places(NamedTuple):
+    """Places of the unknowns in the reduced matrix.
+
+    Attributes:
+        pose: First unknown of each pose, int64, shape (K,).
+        stem: First unknown of each stem that remains, -1 for an eliminated one, int64, shape (L,).
+        first, width, offset: See Envelope.
+    """
+
+    pose: Int
+    stem: Int
+    first: Int
+    width: Int
+    offset: Int
 
 
 class Normal(NamedTuple):
@@ -104,31 +115,29 @@ class Problem:
         self.u = np.array(motion).reshape(-1, 3)
         floor = np.diag(np.square(MOTION_SIGMA_MIN))
         self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
-        self.place, self.last, self.envelope = self._elimination_order()
+        self.places, self.envelope = self._elimination_order()
 
-    def _elimination_order(self) -> tuple[Int, Int, Envelope]:
-        """Return the first unknown of each pose and of each stem in the reduced matrix, see Places, and its
-        envelope."""
+    def _elimination_order(self) -> tuple[Places, Envelope]:
+        """Return the places of the unknowns in the reduced matrix, and its envelope."""
         from scipy import sparse
         from scipy.sparse.csgraph import reverse_cuthill_mckee
 
         K, L, E = len(self.pose), len(self.birth), len(self.first)
-        views = np.diff(self.begin)
-        remains = views > VIEWS_MAX
-        last = np.where(remains, 3 * K + 2 * (np.cumsum(remains) - 1), -1)
-        far = remains[self.of]  # detections of stems that remain
-        pair = self.row[~far], self.of[~far]
-        seen = sparse.csr_matrix((np.ones(len(pair[0])), pair), shape=(K, L))
+        remains = np.diff(self.begin) > VIEWS_MAX
+        stem = np.where(remains, 3 * K + 2 * (np.cumsum(remains) - 1), -1)
+        kept = remains[self.of]  # detections of the stems that remain
+        row, of = self.row[~kept], self.of[~kept]
+        seen = sparse.csr_matrix((np.ones(len(row)), (row, of)), shape=(K, L))
         edges = sparse.csr_matrix((np.ones(E), (self.first, self.second)), shape=(K, K))
         coupled = (seen @ seen.T + edges + edges.T).tocsr()
-        place = np.empty(K, np.int64)
-        place[reverse_cuthill_mckee(coupled, symmetric_mode=True)] = 3 * np.arange(K)
+        pose = np.empty(K, np.int64)
+        pose[reverse_cuthill_mckee(coupled, symmetric_mode=True)] = 3 * np.arange(K)
         pairs = coupled.tocoo()
-        rows = np.concatenate(
-            [place[pairs.row] + p for p in range(3)] + [last[self.of[far]] + q for q in (0, 1)]
-        )
-        columns = np.concatenate([place[pairs.col]] * 3 + [place[self.row[far]]] * 2)
-        return place, last, Envelope.of(rows, columns, 3 * K + 2 * int(remains.sum()), SIDE)
+        rows = [pose[pairs.row] + p for p in range(3)] + [stem[self.of[kept]] + q for q in range(2)]
+        columns = [pose[pairs.col]] * 3 + [pose[self.row[kept]]] * 2
+        count = 3 * K + 2 * int(remains.sum())
+        envelope = Envelope.of(np.concatenate(rows), np.concatenate(columns), count, SIDE)
+        return Places(pose, stem, envelope.first, envelope.width, envelope.offset), envelope
 
     def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Normal] | None:
         """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
@@ -223,8 +232,8 @@ class Problem:
         except np.linalg.LinAlgError:
             return None
         step = -factor.solve(right)
-        dx = step[self.place[:, None] + np.arange(3)]
-        dl = _stem_steps(normal, inverse_V, self.row, self.begin, self.last, step, dx)
+        dx = step[self.places.pose[:, None] + np.arange(3)]
+        dl = _stem_steps(normal, inverse_V, self.row, self.begin, self.places, step)
         return (dx, dl) if np.isfinite(dx).all() and np.isfinite(dl).all() else None
 
     def _reduced(self, normal: Normal, damping: float) -> tuple[Factor, Float, Float]:
@@ -241,12 +250,10 @@ class Problem:
         Raises:
             LinAlgError: The reduced matrix is not positive definite.
         """
-        envelope = self.envelope
-        values, right = np.zeros(envelope.offset[-1]), np.zeros(envelope.count)
-        places = self.place, self.last, envelope.first, envelope.width, envelope.offset
-        _write_poses(normal, self.first, self.second, places, damping, values, right)
-        inverse_V = _write_stems(normal, self.row, self.begin, places, damping, values, right)
-        return Factor(values, envelope), right, inverse_V
+        values, right = np.zeros(self.envelope.offset[-1]), np.zeros(self.envelope.count)
+        _write_poses(normal, self.first, self.second, self.places, damping, values, right)
+        inverse_V = _write_stems(normal, self.row, self.begin, self.places, damping, values, right)
+        return Factor(values, self.envelope), right, inverse_V
 
     def marginals(self, normal: Normal) -> tuple[Float, Float]:
         """Return `covariance` and `of_map` of the solution, shape (K, 3, 3) each. They are computed from the
@@ -259,7 +266,7 @@ class Problem:
         K = len(self.pose)
         factor, _, _ = self._reduced(normal, 0.0)
         chosen = np.unique(np.r_[1, np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64)])
-        rows = self.place[chosen, None] + np.arange(3)
+        rows = self.places.pose[chosen, None] + np.arange(3)
         unit = np.zeros((self.envelope.count, rows.size))
         unit[rows.ravel(), np.arange(rows.size)] = 1.0
         inverse = factor.solve(unit)
@@ -324,9 +331,9 @@ def _add_detections(
 @compiled
 def _entry(row: int, column: int, places: Places) -> int:
     """Return where the entry of a row and a column up to it is stored."""
-    _, _, first, width, offset = places
     block = row // SIDE
-    at: int = offset[block] + (row - SIDE * block) * width[block] + column - SIDE * first[block]
+    start = places.offset[block] - SIDE * places.first[block]
+    at: int = start + (row - SIDE * block) * places.width[block] + column
     return at
 
 
@@ -339,13 +346,13 @@ def _write_poses(
     Args:
         normal: Normal equations.
         first, second: Poses of each motion and loop, int64, shape (E,).
-        places: See Places.
+        places: Places of the unknowns.
         damping: Share of the diagonal that is added to it.
         values: Entries of the reduced matrix in the places of the envelope, zeros at first; filled on and
             below the diagonal. Rows beyond the last unknown become those of the identity.
         right: Gradient in the order of the unknowns, shape (N,); filled for the poses.
     """
-    place = places[0]
+    place = places.pose
     for k in range(place.shape[0]):
         for p in range(3):
             right[place[k] + p] = normal.g_x[k, p]
@@ -359,7 +366,7 @@ def _write_poses(
             at = _entry(max(i, j) + p, min(i, j), places)
             for q in range(3):
                 values[at + q] += normal.edge[e, p, q] if i < j else normal.edge[e, q, p]
-    for n in range(right.shape[0], SIDE * places[2].shape[0]):
+    for n in range(right.shape[0], SIDE * places.first.shape[0]):
         values[_entry(n, n, places)] = 1.0
 
 
@@ -377,21 +384,21 @@ def _write_stems(
         places, damping, values: See `_write_poses`.
         right: Gradient in the order of the unknowns, shape (N,); changed in place.
     """
-    place, last = places[0], places[1]
+    place, stem = places.pose, places.stem
     inverse = np.zeros((normal.V.shape[0], 3))
     T = np.empty((3, 2))
     for j in range(inverse.shape[0]):
         xx = (1.0 + damping) * normal.V[j, 0] + REGULAR
         yy = (1.0 + damping) * normal.V[j, 2] + REGULAR
         xy = normal.V[j, 1]
-        if last[j] >= 0:
-            values[_entry(last[j], last[j], places)] += xx
-            values[_entry(last[j] + 1, last[j], places)] += xy
-            values[_entry(last[j] + 1, last[j] + 1, places)] += yy
+        if stem[j] >= 0:
+            values[_entry(stem[j], stem[j], places)] += xx
+            values[_entry(stem[j] + 1, stem[j], places)] += xy
+            values[_entry(stem[j] + 1, stem[j] + 1, places)] += yy
             for q in range(2):
-                right[last[j] + q] = normal.g_l[j, q]
+                right[stem[j] + q] = normal.g_l[j, q]
                 for m in range(begin[j], begin[j + 1]):
-                    at = _entry(last[j] + q, place[row[m]], places)
+                    at = _entry(stem[j] + q, place[row[m]], places)
                     for p in range(3):
                         values[at + p] += normal.W[m, p, q]
             continue
@@ -414,28 +421,26 @@ def _write_stems(
 
 
 @compiled
-def _stem_steps(
-    normal: Normal, inverse_V: Float, row: Int, begin: Int, last: Int, step: Float, dx: Float
-) -> Float:
+def _stem_steps(normal: Normal, inverse_V: Float, row: Int, begin: Int, places: Places, step: Float) -> Float:
     """Return the steps of the stems, shape (L, 2) [m]: -V^-1 (g_l + W^T dx) of the eliminated ones.
 
     Args:
         normal: Normal equations.
-        inverse_V, row, begin: See `_write_stems`.
-        last: First unknown of each stem that remains, -1 for others, int64, shape (L,).
+        inverse_V, row, begin, places: See `_write_stems`.
         step: Step of all unknowns of the reduced matrix, shape (N,).
-        dx: Steps of the poses, shape (K, 3).
     """
     dl = np.empty((inverse_V.shape[0], 2))
     for j in range(dl.shape[0]):
-        if last[j] >= 0:
-            dl[j, 0], dl[j, 1] = step[last[j]], step[last[j] + 1]
+        at = places.stem[j]
+        if at >= 0:
+            dl[j, 0], dl[j, 1] = step[at], step[at + 1]
             continue
         gx, gy = normal.g_l[j, 0], normal.g_l[j, 1]
         for m in range(begin[j], begin[j + 1]):
             for p in range(3):
-                gx += normal.W[m, p, 0] * dx[row[m], p]
-                gy += normal.W[m, p, 1] * dx[row[m], p]
+                dx = step[places.pose[row[m]] + p]
+                gx += normal.W[m, p, 0] * dx
+                gy += normal.W[m, p, 1] * dx
         dl[j, 0] = -inverse_V[j, 0] * gx - inverse_V[j, 1] * gy
         dl[j, 1] = -inverse_V[j, 1] * gx - inverse_V[j, 2] * gy
     return dl

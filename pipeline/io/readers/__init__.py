@@ -16,7 +16,7 @@ __all__ = ["Source", "SourceDescription", "SourceOptions", "open_source", "path_
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+]+):")
 _LIVE = ("udp", "tcp", "ros2")
-_FILE_SCHEME = re.compile(r"file:(//)?")
+_FILE_SCHEME = re.compile(r"file:(//)?", re.IGNORECASE)
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:
@@ -85,7 +85,7 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
 
         return open_simulated(uri, options)
     if scheme == "file":
-        return open_source(uri[len("file:") :].removeprefix("//"), options)
+        return open_source(path_of(uri), options)
     if scheme in ("zenoh", "velodyne", "dds"):
         raise SourceError("a live robot cannot be read as a file", where=uri, remedy="Watch it or map it.")
     if scheme in _LIVE:

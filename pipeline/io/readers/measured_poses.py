@@ -444,13 +444,12 @@ def align_poses(
         return None, why
     ours = interpolated(at_ns, stamp_ns, np.column_stack([np.cos(path[:, 2]), np.sin(path[:, 2])]))
     off = wrap_angle(np.arctan2(ours[:, 1], ours[:, 0]) - other[:, 2])
-    off = off[(at_ns >= stamp_ns[0]) & (at_ns <= stamp_ns[-1])]
     turn = math.atan2(float(np.sin(off).mean()), float(np.cos(off).mean()))
     scatter = float(np.sqrt(np.square(wrap_angle(off - turn)).mean()))
     # In the middle of the stretch a third of the variance of the drift has accumulated.
     drift, turn_drift = DRIFT**2 * fit.length / 3.0, TURN_DRIFT**2 * fit.length / 3.0
     own = math.sqrt(float(np.median([pose.covariance[2, 2] for pose in poses])))
-    heading = max(own, scatter) / math.sqrt(max(len(off) / 10.0, 1.0))
+    heading = max(own, scatter) / math.sqrt(max(len(poses) / 10.0, 1.0))
     return OtherFrame(
         fit,
         math.sqrt(fit.sigma**2 + drift),

@@ -108,14 +108,14 @@ async def test_a_search_that_fails_says_why_and_another_can_begin(command, words
 
 
 async def test_the_search_before_stays_if_no_process_can_be_started():
-    told: list[dict[str, Any]] = []
-    search = TuneSearch(told.append, says(*SAID))
+    states: list[dict[str, Any]] = []
+    search = TuneSearch(states.append, says(*SAID))
     await search.start(PLAN)
     await until(lambda: not search.is_under_way)
     search._command = ["/no/such/program"]
     with pytest.raises(StemmapError):
         await search.start(PLAN)
-    assert search.as_plain() == told[-1]
+    assert search.as_plain() == states[-1]
     assert search.result == RESULT
 
 

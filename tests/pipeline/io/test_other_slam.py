@@ -32,7 +32,6 @@ STEPS, STRIDE = 90, 0.5
 SIGMA = (0.05, 0.01)
 NAMED = SourceOptions(topics={"pose": "/other/pose"})
 JUMP_AT = 80
-PLACES = [(0.4 * k, 0.0) for k in range(40)]  # x and yaw of a straight drive
 
 
 def covariance(xy: float = SIGMA[0], yaw: float = SIGMA[1]) -> list[float]:
@@ -62,17 +61,6 @@ def test_any_frame_is_found_again(x: float, y: float, yaw: float, seed: int):
     assert measured is not None
     assert measured.is_sound()
     np.testing.assert_allclose(measured.T_map_base.as_array(), [30.0, 4.0, 0.3], atol=1e-6)
-
-
-def test_a_turn_before_the_odometry_begins_does_not_count_against_the_headings():
-    placed = [
-        OtherPose.of(k * STEP_NS, Pose3.from_euler(np.array([x, 0.0, 0.0]), 0.0, 0.0, yaw), covariance())
-        for k, (x, yaw) in enumerate([(0.0, 0.1 * turn) for turn in range(20, 0, -1)] + PLACES)
-    ]
-    stamps = [(20 + k) * STEP_NS for k in range(len(PLACES))]
-    found, why = align_poses(placed, stamps, np.array([[x, 0.0, yaw] for x, yaw in PLACES]))
-    assert found is not None, why
-    assert found.turn == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("entry", [0.0, -1.0, np.nan, np.inf])
@@ -144,7 +132,7 @@ def test_poor_wheels_are_put_right_by_a_good_slam(tmp_path: Path, opened: Opened
     error = with_it[:, :2] - true
     rms = np.sqrt(np.square(error).sum(axis=1).mean())
     assert refused == 0
-    assert rms < 0.45 * np.sqrt(np.square(alone[:, :2] - true).sum(axis=1).mean())
+    assert rms < 0.4 * np.sqrt(np.square(alone[:, :2] - true).sum(axis=1).mean())
 
 
 def test_a_jump_of_the_other_slam_moves_nothing(tmp_path: Path, opened: Opened):

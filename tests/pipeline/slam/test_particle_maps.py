@@ -65,5 +65,5 @@ def test_the_landmarks_in_reach_are_those_at_a_smaller_distance(seed):
         mean, covariance, hits, _, birth = map_of(maps, p)
         near = np.hypot(*(mean - at).T) < reach
         wanted = mean[near], covariance[near], hits[near], birth[near]
-        for column, told in zip(wanted, known_near(maps, p, at[0], at[1], reach), strict=True):
-            np.testing.assert_array_equal(told, column)
+        for expected, found in zip(wanted, known_near(maps, p, at[0], at[1], reach), strict=True):
+            np.testing.assert_array_equal(found, expected)
