@@ -10,9 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Float
-from pipeline.types.records import Int
+
+Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
