@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -17,18 +17,23 @@ from pipeline.io.readers.point_files import (
     MISSING,
     MOST_POINTS,
     PART,
+    Columns,
+    PointTable,
     ScanFileError,
+    errors_as_damage,
     open_table,
 )
-from pipeline.types.records import CloudDescription, Float, Float32, WholeCloud
+from pipeline.types.records import CloudDescription, Float, Float32
 
 if TYPE_CHECKING:
     import laspy
 
 _REMEDY = "Copy the file again, or export it again"
+_AXES = ("x", "y", "z")
+_INVALID = "points without coordinates, or withheld by the file"
 
 
-def open_cloud(uri: str) -> WholeCloud:
+def open_cloud(uri: str) -> PointCloud:
     """Open a whole cloud by its first bytes or its suffix: E57, LAS or LAZ, else a PLY, NumPy or PCD file.
 
     Raises:
@@ -36,12 +41,9 @@ def open_cloud(uri: str) -> WholeCloud:
     """
     try:
         path = Path(uri).expanduser()
-        with path.open("rb") as file:
-            head = file.read(8)
-        if head == b"ASTM-E57" or path.suffix.lower() == ".e57":
-            return E57Cloud(uri, path)
-        is_las = head.startswith(b"LASF") or path.suffix.lower() in (".las", ".laz")
-        return LasCloud(uri, path) if is_las else TableCloud(uri, path)
+        return PointCloud(uri, path, open_points(path))
+    except ScanFileError as error:
+        raise SourceError(str(error), where=uri, remedy=_REMEDY) from None
     except MemoryError:
         raise SourceError("it is too large for the memory of this machine", where=uri) from None
     except (OSError, ValueError, RuntimeError) as error:  # a path with a zero byte, an unknown home
@@ -49,6 +51,23 @@ def open_cloud(uri: str) -> WholeCloud:
         raise SourceError(
             f"cannot open: {reason}", where=uri, remedy="Look at the path and its rights"
         ) from None
+
+
+def open_points(path: Path) -> PointTable:
+    """Return the table of a file: LAS, LAZ and E57 by its first bytes or its suffix, else by `open_table`.
+
+    Raises:
+        ScanFileError: The file has an unknown format, contradicts itself, or has no x, y and z; or it is an
+            E57 file and pye57 is not installed.
+        OSError: The file cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(8)
+    if head == b"ASTM-E57" or path.suffix.lower() == ".e57":
+        return _open_e57(path)
+    if head.startswith(b"LASF") or path.suffix.lower() in (".las", ".laz"):
+        return _open_las(path)
+    return open_table(path)
 
 
 def is_place(xyz: Float) -> NDArray[np.bool_]:
@@ -67,32 +86,46 @@ def offset_for(middle: Float) -> Float:
     return np.where(np.abs(middle) < 1000.0, 0.0, np.round(middle / 100.0) * 100.0)
 
 
-class CloudFile:
+class PointCloud:
     """A file of points as a cloud (see `pipeline.types.records.WholeCloud`).
-
-    A subclass opens the file (`_open`), calls `_describe`, and yields the points (`_read`).
 
     Args:
         uri: Path as the user wrote it.
         path: The file.
+        table: Table of the file.
 
     Raises:
-        SourceError: The file cannot be read, has another format, is damaged, or has no valid point.
+        ScanFileError: The file is damaged, or has no valid point.
+        OSError: The file cannot be read.
     """
 
-    name: str  # of the format, in errors
-    description: CloudDescription
-
-    def __init__(self, uri: str, path: Path) -> None:
-        """Open the file and read its description and its first points.
+    def __init__(self, uri: str, path: Path, table: PointTable) -> None:
+        """Read the first points, which decide the offset, and the digest.
 
         Raises:
-            SourceError: The file cannot be read, has another format, is damaged, or has no valid point.
+            ScanFileError: The file is damaged, or has no valid point.
+            OSError: The file cannot be read.
         """
-        self._uri, self._path = uri, path
+        self._table = table
         self.losses: dict[str, int] = {}
-        with self._one_error():
-            self.description = self._describe()
+        for xyz in self._positions():
+            first = xyz[is_place(xyz)][:1000]
+            if len(first):
+                break
+        else:
+            raise ScanFileError("the cloud has no points with valid coordinates")
+        self.description = CloudDescription(
+            uri,
+            table.kind,
+            table.points,
+            offset_for(first.mean(axis=0)),
+            crs=table.crs,
+            digest=digest_of([path]),
+            low=table.low,
+            high=table.high,
+            attributes=(*(name for name in table.names if name not in _AXES), *table.attributes),
+            cut_above=table.cut_above,
+        )
 
     def parts(self) -> Iterator[Float32]:
         """Yield all points part by part, relative to `description.offset`, float32, shape (N, 3) [m]; parts
@@ -105,94 +138,26 @@ class CloudFile:
         self.losses = {}
         read = 0
         try:
-            with self._one_error():
-                for points, xyz in self._read():
-                    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may have any size
-                        xyz = xyz - self.description.offset
-                    good = is_place(xyz)
-                    read += points
-                    if not good.all():
-                        count_loss(self.losses, "points without coordinates", int(np.count_nonzero(~good)))
-                    yield xyz[good].astype(np.float32)
-        except SourceError:
-            if read == 0:
-                raise
-            # Points before the damage are valid.
+            for xyz in self._positions():
+                with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may have any size
+                    xyz = xyz - self.description.offset
+                good = is_place(xyz)
+                read += len(xyz)
+                if not good.all():
+                    count_loss(self.losses, _INVALID, int(np.count_nonzero(~good)))
+                yield xyz[good].astype(np.float32)
+        except (OSError, ScanFileError) as error:
+            what = f"cannot read: {error.strerror or error}" if isinstance(error, OSError) else str(error)
+            raise SourceError(what, where=self.description.uri, remedy=_REMEDY) from None
         if read < self.description.points:
             count_loss(self.losses, MISSING, self.description.points - read)
 
-    def _describe(self) -> CloudDescription:
-        """Return the description. Subclasses implement it."""
-        raise NotImplementedError
-
-    def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the positions part by part, shape (N, 3) [m], in the frame of the file, each with the number
-        of points read for it. Subclasses implement it."""
-        raise NotImplementedError
-
-    def _described(self, kind: str, points: int, **known: Any) -> CloudDescription:  # noqa: ANN401
-        """Return a description with the offset by the first valid positions.
-
-        Args:
-            kind, points, known: Fields of the description.
-
-        Raises:
-            SourceError: No point has valid coordinates.
-            OSError: The file cannot be read.
-        """
-        for _, xyz in self._read():
-            first = xyz[is_place(xyz)][:1000]
-            if len(first):
-                offset, digest = offset_for(first.mean(axis=0)), digest_of([self._path])
-                return CloudDescription(self._uri, kind, points, offset, digest=digest, **known)
-        raise SourceError("the cloud has no points with valid coordinates", where=self._uri, remedy=_REMEDY)
-
-    @contextmanager
-    def _one_error(self) -> Iterator[None]:
-        """Raise any exception of a library or of the system as a SourceError; SourceError passes
-        unchanged."""
-        try:
-            yield
-        except SourceError:
-            raise
-        except OSError as error:
-            what = f"cannot read: {error.strerror or error}"
-            raise SourceError(what, where=self._uri, remedy=_REMEDY) from None
-        except ScanFileError as error:
-            raise SourceError(str(error), where=self._uri, remedy=_REMEDY) from None
-        except BaseException as error:
-            # A panic of the LAZ decoder is no Exception.
-            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-                raise
-            reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-            what = f"the {self.name} file is damaged: {reason}"
-            raise SourceError(what, where=self._uri, remedy=_REMEDY) from None
-
-
-class TableCloud(CloudFile):
-    """A PLY, NumPy or PCD file as a cloud."""
-
-    name = "point"
-
-    def _describe(self) -> CloudDescription:
-        """Return the description by the header of the table, which is stored for reading.
-
-        Raises:
-            ScanFileError: The file is not such a table, or its data is damaged.
-            SourceError: No point has valid coordinates.
-            OSError: The file cannot be read.
-        """
-        self._table = table = open_table(self._path)
-        attributes = tuple(name for name in table.names if name not in ("x", "y", "z"))
-        return self._described(table.kind, table.points, crs="", attributes=attributes)
-
-    def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the coordinates of all rows, valid or not, shape (N, 3) [m], each part with its number of
-        points."""
+    def _positions(self) -> Iterator[Float]:
+        """Yield the coordinates of all rows, valid or not, shape (N, 3) [m], in the frame of the file; errors
+        are those of `PointTable.parts`."""
         for columns in self._table.parts():
             with np.errstate(over="ignore", invalid="ignore"):
-                xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
-            yield len(xyz), xyz
+                yield np.stack([columns[axis].astype(np.float64) for axis in _AXES], axis=1)
 
 
 # --- LAS and LAZ ---
@@ -212,51 +177,48 @@ _LAYERS, _BYTES_14 = {10: 9, 11: 1, 12: 2, 13: 1}, 14
 SYSTEM_OF_DRIVE = "stemmap drive"
 
 
-class LasCloud(CloudFile):
-    """A .las or .laz file as a cloud."""
+def _open_las(path: Path) -> PointTable:
+    """Return the table of the positions in a LAS or LAZ file; withheld points are NaN. Its header is checked
+    before laspy reads it.
 
-    name = "LAS"
+    Raises:
+        ScanFileError: The header is damaged, contradicts itself or the file, or names too many points.
+        OSError: The file cannot be read.
+    """
+    points, there, compressed, version = _check_las(path)
+    with errors_as_damage("the LAS file is damaged"), _las_reader(path) as reader:
+        header = reader.header
+        scales, offsets = header.scales.copy(), header.offsets.copy()
+        crs, system = _crs_of(header), str(header.system_identifier).rstrip("\0")
+        dimensions = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
+        low, high = (np.array(corner, np.float64) for corner in (header.mins, header.maxs))
 
-    def _describe(self) -> CloudDescription:
-        """Return the description by the header, which is checked before laspy reads it, and store the number
-        of points that can be read. An error of laspy is not caught.
-
-        Raises:
-            SourceError: The header contradicts itself or the file, names too many points, or no point has
-                valid coordinates.
-            OSError: The file cannot be read.
-        """
-        points, self._there, compressed, version = _check_las(self._path, self._uri)
-        with _open_las(self._path) as reader:
-            header = reader.header
-        return self._described(
-            f"LAS {version}" + (" compressed" if compressed else ""),
-            points,
-            crs=_crs_of(header),
-            low=np.array(header.mins, np.float64),
-            high=np.array(header.maxs, np.float64),
-            attributes=tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z")),
-            cut_above=str(header.system_identifier).rstrip("\0") == SYSTEM_OF_DRIVE,
-        )
-
-    def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the coordinates of the points before any damage, shape (N, 3) [m], each part with the number
-        of points read. Withheld points are omitted and counted in `losses`."""
-        read = 0
-        with _open_las(self._path) as reader:
-            scales, offsets = reader.header.scales.copy(), reader.header.offsets.copy()
-            while read < self._there and len(chunk := reader.read_points(min(_LAS_PART, self._there - read))):
-                raw = np.stack([np.asarray(chunk[axis], np.float64) for axis in ("X", "Y", "Z")], axis=1)
+    def read() -> Iterator[Columns]:
+        """Yield the coordinates of the points that the file can hold, float64 [m]."""
+        left = there
+        with _las_reader(path) as reader:
+            while left and len(chunk := reader.read_points(min(_LAS_PART, left))):
+                raw = np.stack([np.asarray(chunk[axis], np.float64) for axis in ("X", "Y", "Z")])
                 with np.errstate(over="ignore", invalid="ignore"):
-                    xyz = raw * scales + offsets
-                withheld = np.asarray(chunk.withheld).astype(np.bool_)
-                if withheld.any():
-                    count_loss(self.losses, "points that the file withholds", int(np.count_nonzero(withheld)))
-                read += len(xyz)
-                yield len(xyz), xyz[~withheld]
+                    xyz = raw * scales[:, None] + offsets[:, None]
+                xyz[:, np.asarray(chunk.withheld).astype(np.bool_)] = np.nan
+                left -= xyz.shape[1]
+                yield dict(zip(_AXES, xyz, strict=True))
+
+    return PointTable(
+        f"LAS {version}" + (" compressed" if compressed else ""),
+        points,
+        _AXES,
+        read,
+        attributes=dimensions,
+        crs=crs,
+        low=low,
+        high=high,
+        cut_above=system == SYSTEM_OF_DRIVE,
+    )
 
 
-def _open_las(path: Path) -> laspy.LasReader:
+def _las_reader(path: Path) -> laspy.LasReader:
     """Return a laspy reader that decompresses in this thread."""
     import laspy
 
@@ -264,7 +226,7 @@ def _open_las(path: Path) -> laspy.LasReader:
     return laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False)
 
 
-def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
+def _check_las(path: Path) -> tuple[int, int, bool, str]:
     """Check the sizes in the header of a LAS file against the size of the file, before laspy reads it.
 
     Returns:
@@ -272,7 +234,7 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
         and the version.
 
     Raises:
-        SourceError: The file is not a LAS file, the sizes contradict each other, there are no or too many
+        ScanFileError: The file is not a LAS file, the sizes contradict each other, there are no or too many
             points, or none before the first damage.
         OSError: The file cannot be read.
     """
@@ -280,7 +242,7 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
     with path.open("rb") as file:
         head = file.read(375)
         if len(head) < 227 or head[:4] != b"LASF":
-            raise SourceError("the contents are not those of a LAS file", where=uri, remedy=_REMEDY)
+            raise ScanFileError("the contents are not those of a LAS file")
         version = f"{head[24]}.{head[25]}"
         header_size, first, records = struct.unpack_from("<HII", head, 94)
         kind, length, points = struct.unpack_from("<BHI", head, 104)
@@ -289,29 +251,27 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
         compressed = kind >= 0x80
         fits = header_size <= first <= size and records * 54 <= first - header_size
         if not fits or not 20 <= length <= RECORD_LIMIT:
-            raise SourceError("the header of the LAS file contradicts itself", where=uri, remedy=_REMEDY)
+            raise ScanFileError("the header of the LAS file contradicts itself")
         room = size - first
         # A file that is cut is read up to its end.
         there = points if compressed else min(points, room // length)
         if points and there == 0:
-            raise SourceError("the LAS file ends before its first point", where=uri, remedy=_REMEDY)
+            raise ScanFileError("the LAS file ends before its first point")
         if compressed:
-            record, layers = _check_items(file, header_size, first, records, length, uri)
-            _check_chunks(file, first, size, uri)
+            record, layers = _check_items(file, header_size, first, records, length)
+            _check_chunks(file, first, size)
             if layers:
                 there = min(points, _points_before_damage(file, first, length, record, layers))
             if points and there == 0:
-                raise SourceError("the first chunk of the LAS file is damaged", where=uri, remedy=_REMEDY)
+                raise ScanFileError("the first chunk of the LAS file is damaged")
     if points == 0:
-        raise SourceError("the cloud has no points", where=uri)
+        raise ScanFileError("the cloud has no points")
     if points > MOST_POINTS or (compressed and points > 4000 * room):
-        raise SourceError("the header of the LAS file promises too many points", where=uri, remedy=_REMEDY)
+        raise ScanFileError("the header of the LAS file promises too many points")
     return points, there, compressed, version
 
 
-def _check_items(
-    file: IO[bytes], at: int, end: int, records: int, length: int, uri: str
-) -> tuple[bytes, int]:
+def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int) -> tuple[bytes, int]:
     """Check that the sum of the lengths of the compressed items of a point is the length of a point (LASzip,
     `laszip.check`).
 
@@ -322,13 +282,12 @@ def _check_items(
         at, end: First byte of the variable-length records, and first byte after them.
         records: Number of these records.
         length: Length of a point by the header [bytes].
-        uri: Name of the file in errors.
 
     Returns:
         The record of LASzip, b"" if there is none, and the number of layers of a chunk, 0 if it has none.
 
     Raises:
-        SourceError: The lengths differ.
+        ScanFileError: The lengths differ.
     """
     for _ in range(records):
         file.seek(at)
@@ -344,7 +303,7 @@ def _check_items(
         table = record[_ITEMS : _ITEMS + _ITEM.size * items]
         table = table[: len(table) // _ITEM.size * _ITEM.size]
         if sum(size for _, size, _ in _ITEM.iter_unpack(table)) != length:
-            raise SourceError("the header of the LAS file contradicts itself", where=uri, remedy=_REMEDY)
+            raise ScanFileError("the header of the LAS file contradicts itself")
         kinds = [(kind, size) for kind, size, _ in _ITEM.iter_unpack(table)]
         return record, sum(size if kind == _BYTES_14 else _LAYERS.get(kind, 0) for kind, size in kinds)
     return b"", 0
@@ -375,17 +334,16 @@ def _points_before_damage(file: IO[bytes], first: int, length: int, record: byte
     return points
 
 
-def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
+def _check_chunks(file: IO[bytes], first: int, size: int) -> None:
     """Check that the chunk table is inside the file and has no more entries than the file has bytes.
 
     Args:
         file: The opened file.
         first: First byte of the points.
         size: Size of the file [bytes].
-        uri: Name of the file in errors.
 
     Raises:
-        SourceError: The file is cut off, or its table is too large.
+        ScanFileError: The file is cut off, or its table is too large.
     """
     file.seek(first)
     raw = file.read(8)
@@ -394,11 +352,11 @@ def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
         file.seek(size - 8)
         at = struct.unpack("<q", file.read(8))[0]
     if not first + 8 <= at <= size - 8:
-        raise SourceError("the compressed LAS file is cut off", where=uri, remedy=_REMEDY)
+        raise ScanFileError("the compressed LAS file is cut off")
     file.seek(at)
     _, chunks = struct.unpack("<II", file.read(8))
     if chunks > size:
-        raise SourceError("the header of the LAS file contradicts itself", where=uri, remedy=_REMEDY)
+        raise ScanFileError("the header of the LAS file contradicts itself")
 
 
 def _crs_of(header: laspy.LasHeader) -> str:
@@ -428,81 +386,62 @@ def _crs_of(header: laspy.LasHeader) -> str:
 MOST_STATIONS = 10_000
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+_STATES = ("cartesianInvalidState", "sphericalInvalidState")
 
 
-class E57Cloud(CloudFile):
-    """An E57 file (ASTM E2807) as a cloud: all stations in one frame."""
+def _open_e57(path: Path) -> PointTable:
+    """Return the table of the positions of all stations of an E57 file (ASTM E2807) in one frame; invalid
+    points are NaN.
 
-    name = "E57"
+    Raises:
+        ScanFileError: pye57 is not installed, the file is damaged, or there are too many stations or points.
+        OSError: The file cannot be read.
+    """
+    try:
+        from pye57 import E57
+    except ImportError:
+        raise ScanFileError("E57 files need pye57; install it with: uv sync --extra e57") from None
+    with errors_as_damage("the E57 file is damaged"), closing(E57(str(path))) as file:
+        stations = int(file.scan_count)
+        if stations > MOST_STATIONS:
+            raise ScanFileError(f"it promises {stations} stations")
+        points = [int(file.get_header(k).point_count) for k in range(stations)]
+    if not all(0 <= n <= MOST_POINTS for n in points) or sum(points) > MOST_POINTS:
+        raise ScanFileError("it promises more points than there can be")
 
-    def _describe(self) -> CloudDescription:
-        """Return the description by the headers of the stations. An error of pye57 is not caught.
+    def read() -> Iterator[Columns]:
+        """Yield the coordinates of the points of all stations, float64 [m]."""
+        with closing(E57(str(path))) as file:
+            for station in range(stations):
+                for xyz in _station(file, station):
+                    yield dict(zip(_AXES, xyz.T, strict=True))
 
-        Raises:
-            SourceError: pye57 is not installed, there are too many stations or points, or no point has valid
-                coordinates.
-            OSError: The file cannot be read.
-        """
-        with closing(self._open()) as file:
-            stations = int(file.scan_count)
-            if stations > MOST_STATIONS:
-                raise SourceError(f"it promises {stations} stations", where=self._uri, remedy=_REMEDY)
-            points = [int(file.get_header(k).point_count) for k in range(stations)]
-        if not all(0 <= n <= MOST_POINTS for n in points) or sum(points) > MOST_POINTS:
-            raise SourceError("it promises more points than there can be", where=self._uri, remedy=_REMEDY)
-        kind = f"E57, {stations} station{'s' * (stations != 1)}"
-        return self._described(kind, sum(points), crs="")
+    return PointTable(f"E57, {stations} station{'s' * (stations != 1)}", sum(points), _AXES, read)
 
-    def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the positions of the points of all stations in the frame of the file, shape (N, 3) [m], NaN
-        for invalid ones, each part with its number of points. Errors of pye57 are not caught.
 
-        Raises:
-            SourceError: pye57 is not installed, or points have no coordinates.
-        """
-        with closing(self._open()) as file:
-            for station in range(int(file.scan_count)):
-                for xyz in self._station(file, station):
-                    yield len(xyz), xyz
+def _station(file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types
+    """Yield the points of a station in the frame of the file in parts, shape (N, 3) [m]; NaN for invalid
+    ones.
 
-    def _station(self, file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types
-        """Yield the points of a station in the frame of the file in parts, shape (N, 3) [m]; NaN for invalid
-        ones.
-
-        Raises:
-            SourceError: The points have no coordinates.
-        """
-        header = file.get_header(station)
-        there = set(header.point_fields)
-        axes = _CARTESIAN if there.issuperset(_CARTESIAN) else _SPHERICAL
-        if not there.issuperset(axes):
-            raise SourceError("its points have no coordinates", where=self._uri, remedy=_REMEDY)
-        wanted = [*axes, *(name for name in _INVALID if name in there)]
-        R, t = _pose(header)
-        arrays, buffers = file.make_buffers(wanted, PART)
-        with closing(header.points.reader(buffers)) as reader:
-            while count := reader.read():
-                columns = {name: np.array(arrays[name][:count], dtype=np.float64) for name in wanted}
-                with np.errstate(over="ignore", invalid="ignore"):
-                    xyz = _cartesian(columns, axes) @ R.T + t
-                for name in wanted[3:]:
-                    xyz[columns[name] != 0] = np.nan
-                yield xyz
-
-    def _open(self) -> Any:  # noqa: ANN401
-        """Return the file opened by pye57.
-
-        Raises:
-            SourceError: pye57 is not installed.
-        """
-        try:
-            from pye57 import E57
-        except ImportError:
-            raise SourceError(
-                "E57 files need pye57", where=self._uri, remedy="Install it with: uv sync --extra e57"
-            ) from None
-        return E57(str(self._path))
+    Raises:
+        ScanFileError: The points have no coordinates.
+    """
+    header = file.get_header(station)
+    there = set(header.point_fields)
+    axes = _CARTESIAN if there.issuperset(_CARTESIAN) else _SPHERICAL
+    if not there.issuperset(axes):
+        raise ScanFileError("its points have no coordinates")
+    wanted = [*axes, *(name for name in _STATES if name in there)]
+    R, t = _pose(header)
+    arrays, buffers = file.make_buffers(wanted, PART)
+    with closing(header.points.reader(buffers)) as reader:
+        while count := reader.read():
+            columns = {name: np.array(arrays[name][:count], dtype=np.float64) for name in wanted}
+            with np.errstate(over="ignore", invalid="ignore"):
+                xyz = _cartesian(columns, axes) @ R.T + t
+            for name in wanted[3:]:
+                xyz[columns[name] != 0] = np.nan
+            yield xyz
 
 
 def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401

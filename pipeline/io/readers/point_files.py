@@ -15,7 +15,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -27,6 +27,7 @@ from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.pose_files import read_rows
 from pipeline.io.readers.scan_columns import POINT_LIMIT
 from pipeline.jit import compiled
+from pipeline.types.records import Float
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -47,7 +48,23 @@ class ScanFileError(Exception):
     """A file does not hold a scan or a cloud; the message gives the reason."""
 
 
-@dataclass(frozen=True, slots=True)
+@contextmanager
+def errors_as_damage(what: str) -> Iterator[None]:
+    """Raise any exception of a library as ScanFileError with the text `what` and the reason; ScanFileError
+    and OSError pass unchanged."""
+    try:
+        yield
+    except (ScanFileError, OSError):
+        raise
+    except BaseException as error:
+        # A panic of the LAZ decoder is no Exception.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise ScanFileError(f"{what}: {reason}") from None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
     """A point file with a valid header.
 
@@ -55,15 +72,41 @@ class PointTable:
         kind: Name of the format, e.g. "PLY binary".
         points: Number of points by the header.
         names: Names of the columns with one number per point, in lower case; x, y and z are among them.
-        parts: Function that yields all points in parts, dicts from names to columns of equal length. Numbers
-            need not be finite. Of a file that is cut or damaged, the points before the damage are yielded.
-            Raises ScanFileError if no point can be read, and OSError.
+        read: Function that yields all points in parts, dicts from names to columns of equal length. Numbers
+            need not be finite. It may raise any exception at damaged data; see `parts`.
+        attributes: Names of the values of a point that are not read, besides its coordinates.
+        crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
+        low, high: Corners by the header, shape (3,) [m]; not checked. None if unknown.
+        cut_above: Whether the field of view of a sensor cuts the trees, as in the cloud of a drive.
     """
 
     kind: str
     points: int
     names: tuple[str, ...]
-    parts: Callable[[], Iterator[Columns]]
+    read: Callable[[], Iterator[Columns]]
+    attributes: tuple[str, ...] = ()
+    crs: str = ""
+    low: Float | None = None
+    high: Float | None = None
+    cut_above: bool = False
+
+    def parts(self) -> Iterator[Columns]:
+        """Yield all points in parts, see `read`. Of a file that is cut or damaged, or cannot be read on, the
+        points before that place are yielded.
+
+        Raises:
+            ScanFileError: The data is damaged before its first point.
+            OSError: The file cannot be read before its first point.
+        """
+        read = 0
+        try:
+            with errors_as_damage("its data is damaged"):
+                for part in self.read():
+                    read += len(part["x"])
+                    yield part
+        except (ScanFileError, OSError):
+            if read == 0:
+                raise
 
 
 def open_table(path: Path) -> PointTable:
@@ -87,21 +130,20 @@ def open_table(path: Path) -> PointTable:
     raise ScanFileError("its contents are not those of a PLY, NumPy or PCD file")
 
 
-def read_columns(path: Path, losses: dict[str, int]) -> Columns:
-    """Return a dict from the names of the columns of a file in lower case to the columns, shape (N,) each; of
-    a damaged file, with the points before the damage.
+def read_columns(table: PointTable, losses: dict[str, int]) -> Columns:
+    """Return a dict from the names of the columns of a table to the columns, shape (N,) each; of a damaged
+    file, with the points before the damage.
 
     Args:
-        path: A PLY, NumPy or PCD file.
+        table: The table.
         losses: Dict from reasons to numbers; the number of points in the header that the file does not have
             is added in place.
 
     Raises:
-        ScanFileError: As `open_table`; the header has more than POINT_LIMIT points, or none of its points can
-            be read. A header with 0 points gives empty columns.
+        ScanFileError: The header has more than POINT_LIMIT points, or none of its points can be read. A
+            header with 0 points gives empty columns.
         OSError: The file cannot be read.
     """
-    table = open_table(path)
     if table.points > POINT_LIMIT:
         raise ScanFileError(f"its header promises {table.points} points, too many for one scan")
     parts = list(table.parts())
@@ -196,8 +238,7 @@ class _Stream:
 
 
 def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) -> PointTable:
-    """Return the table of streams with the same points. Its parts end at the first damage; they raise
-    ScanFileError if the data is damaged before the first point.
+    """Return the table of streams with the same points.
 
     Args:
         path: The file.
@@ -214,26 +255,15 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
         if points and stream.start + stream.dtype.itemsize > stream.room:
             raise ScanFileError("it ends before its first point")
 
-    def parts() -> Iterator[Columns]:
-        """Yield the points in parts, see PointTable; damage ends them.
+    def read() -> Iterator[Columns]:
+        """Yield the points in parts, see PointTable; OSError or _DAMAGE if they cannot be read."""
+        with ExitStack() as stack:
+            for records in zip(*(s.records(path, points, stack) for s in streams), strict=False):
+                n = min(map(len, records))
+                columns = {name: part[name][:n] for part in records for name in part.dtype.names or ()}
+                yield {name: columns[name] for name in usable}
 
-        Raises:
-            ScanFileError: The data is damaged before its first point.
-            OSError: It cannot be read.
-        """
-        read = 0
-        try:
-            with ExitStack() as stack:
-                for records in zip(*(s.records(path, points, stack) for s in streams), strict=False):
-                    n = min(map(len, records))
-                    read += n
-                    columns = {name: part[name][:n] for part in records for name in part.dtype.names or ()}
-                    yield {name: columns[name] for name in usable}
-        except _DAMAGE as error:
-            if read == 0:
-                raise ScanFileError(f"its data is damaged: {error}"[:200]) from None
-
-    return PointTable(kind, points, usable, parts)
+    return PointTable(kind, points, usable, read)
 
 
 def _text_table(
@@ -261,7 +291,7 @@ def _text_table(
     if points and start + skipped + 2 * sum(counts) > path.stat().st_size + 1:
         raise ScanFileError("it ends before its first point")
 
-    def parts() -> Iterator[Columns]:
+    def read() -> Iterator[Columns]:
         """Yield the points in parts, see PointTable; damaged lines are left out.
 
         Raises:
@@ -280,7 +310,7 @@ def _text_table(
                 numbers = len(next((words for line in file if (words := line.split())), []))
                 raise ScanFileError(f"its rows have {numbers} numbers, its header names {sum(counts)}")
 
-    return PointTable(kind, points, usable, parts)
+    return PointTable(kind, points, usable, read)
 
 
 def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
@@ -318,7 +348,7 @@ def _open_pcd(path: Path, head: bytes) -> PointTable:
     if points * dtype.itemsize > WHOLE_LIMIT:
         raise ScanFileError("its packed data is too large; write it as binary")
 
-    def parts() -> Iterator[Columns]:
+    def read() -> Iterator[Columns]:
         """Yield the points as one part. The data has one field after the other, each with all points.
 
         Raises:
@@ -338,7 +368,7 @@ def _open_pcd(path: Path, head: bytes) -> PointTable:
         fields = dict(zip(dtype.names or (), np.split(raw, np.cumsum(lengths)[:-1]), strict=True))
         yield {name: fields[name].view(dtype[name]) for name in usable}
 
-    return PointTable(kind, points, usable, parts)
+    return PointTable(kind, points, usable, read)
 
 
 def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int]:

@@ -13,6 +13,7 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import named, recordings_in
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
+from pipeline.io.readers.clouds import open_points
 from pipeline.io.readers.point_files import ScanFileError, read_columns
 from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns
 from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT, clean_scan, scan_of, sensor_of
@@ -310,40 +311,15 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 
 def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a PCD, PLY or NumPy file as a scan at a time [ns], which may have no points. Invalid returns are
-    left out (`clean_scan`); points of the header that the file does not have are counted in `losses`, in
-    place.
+    """Read a PCD, PLY, NumPy, LAS or LAZ file as a scan at a time [ns], which may have no points; of LAS and
+    LAZ, the positions only. Invalid returns are left out (`clean_scan`); points of the header that the file
+    does not have are counted in `losses`, in place.
 
     Raises:
         ScanFileError: The file is damaged, has no x, y and z, or its header has more than POINT_LIMIT points.
         OSError: The file cannot be read.
     """
-    return scan_of(stamp_ns, read_columns(path, losses))
-
-
-def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a LAS or LAZ file as a scan of positions only at a time [ns]. Its coordinates are in the sensor
-    frame; points that are missing, withheld or without coordinates are counted in `losses`, in place.
-
-    Raises:
-        ScanFileError: The file is damaged, has no valid point, or has more than POINT_LIMIT points.
-        OSError: The file cannot be read.
-    """
-    from pipeline.io.readers.clouds import LasCloud
-
-    try:
-        cloud = LasCloud(str(path), path)
-        if cloud.description.points > POINT_LIMIT:
-            raise ScanFileError(
-                f"its header promises {cloud.description.points} points, too many for one scan"
-            )
-        parts = list(cloud.parts())
-    except SourceError as error:
-        raise ScanFileError(error.what) from None
-    for reason, number in cloud.losses.items():
-        count_loss(losses, reason, number)
-    points = np.concatenate(parts) if parts else np.zeros((0, 3), np.float32)
-    return clean_scan(stamp_ns, points + cloud.description.offset)
+    return scan_of(stamp_ns, read_columns(open_points(path), losses))
 
 
 def _kitti_sensor(scan: Scan) -> Sensor:
@@ -364,6 +340,6 @@ FORMATS: dict[str, tuple[str, Loader, Callable[[Scan], Sensor]]] = {
     ".ply": ("PLY", load_table, sensor_of),
     ".npy": ("NumPy", load_table, sensor_of),
     ".npz": ("NumPy", load_table, sensor_of),
-    ".las": ("LAS", load_las, sensor_of),
-    ".laz": ("LAS", load_las, sensor_of),
+    ".las": ("LAS", load_table, sensor_of),
+    ".laz": ("LAS", load_table, sensor_of),
 }

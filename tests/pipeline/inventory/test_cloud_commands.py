@@ -106,6 +106,6 @@ def test_why_a_cloud_cannot_be_opened_is_said(cloud, monkeypatch, error, says):
     def fails(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("pipeline.io.readers.clouds.LasCloud", fails)
+    monkeypatch.setattr("pipeline.io.readers.clouds._open_las", fails)
     with pytest.raises(SourceError, match=says):
         open_cloud(str(cloud))

@@ -11,7 +11,7 @@ import velodyne_decoder
 from scipy.spatial import cKDTree
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.point_files import read_columns
+from pipeline.io.readers.point_files import open_table, read_columns
 from pipeline.io.readers.velodyne import SENSORS, find_packets, is_data_packet
 from pipeline.types.records import Scan
 from tests.app.robot.test_velodyne import packet
@@ -61,7 +61,7 @@ def test_the_real_capture_gives_four_scans_of_a_vlp_16(real: Path, opened: Opene
 
 
 def test_the_scans_agree_with_the_reference(real: Path, shared_data: Path, opened: Opened):
-    columns = read_columns(shared_data / "velodyne" / "vlp16_reference.pcd", {})
+    columns = read_columns(open_table(shared_data / "velodyne" / "vlp16_reference.pcd"), {})
     reference = np.stack([columns[axis] for axis in "xyz"], axis=1)
     assert len(reference) == 14_831
     distances = [cKDTree(scan.points).query(reference)[0] for scan in scans_of(opened, real)]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.clouds import open_cloud
-from pipeline.io.readers.point_files import ScanFileError, lzf_decompress, read_columns
+from pipeline.io.readers.point_files import ScanFileError, lzf_decompress, open_table, read_columns
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
 
@@ -98,7 +98,7 @@ def test_ascii_binary_and_compressed_hold_the_same(
     for data in ("ascii", "binary", "binary_compressed"):
         path.write_bytes(pcd(rows, data))
         losses: dict[str, int] = {}
-        found.append(read_columns(path, losses))
+        found.append(read_columns(open_table(path), losses))
         assert losses == {}
     for name, column in zip(("x", "y", "z", "ring"), np.array(rows, float).T, strict=True):
         for columns in found:
@@ -144,7 +144,7 @@ def test_headers_that_contradict_themselves_are_refused(data: str, changes: dict
     path = tmp_path / "cloud.pcd"
     path.write_bytes(pcd(ROWS, data, **changes))
     with pytest.raises(ScanFileError):
-        read_columns(path, {})
+        read_columns(open_table(path), {})
 
 
 @pytest.mark.parametrize("data", ["ascii", "binary"])
@@ -171,7 +171,7 @@ def test_a_zip_that_is_damaged_before_its_first_point_is_refused(tmp_path: Path)
     content[len(content) // 2] ^= 0xFF
     path.write_bytes(content)
     with pytest.raises(ScanFileError, match="its data is damaged"):
-        read_columns(path, {})
+        read_columns(open_table(path), {})
 
 
 def test_a_cut_compressed_file_is_refused(tmp_path: Path, opened: Opened):
