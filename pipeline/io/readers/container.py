@@ -67,7 +67,8 @@ class Message:
 
 
 class Container:
-    """A recording of messages, which are not decoded.
+    """A recording of messages, which are not decoded, with an index of all of them. A format calls
+    `_set_index` and implements `_message`.
 
     Attributes:
         kind: Name of the format, e.g. "ROS 2 MCAP".
@@ -81,31 +82,37 @@ class Container:
     channels: list[Channel]
     damage: dict[str, int]
     clock_steps: int = 0
+    #: What is counted for a message whose bytes cannot be read.
+    unreadable = "messages that cannot be read"
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return a time of recording [ns] from which a few messages of some channels are left to read, the
-        last ones of the recording; 0 if there are none.
-
-        Args:
-            numbers: Numbers of the channels.
-        """
-        raise NotImplementedError
+        """Return the time of recording [ns] of the last message but two of some channels, of the first one if
+        there are fewer; 0 if there is none."""
+        rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
+        return int(self.index[rows[-TAIL:][0], 1]) if len(rows) else 0
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield messages in the order of recording. Messages that cannot be read are left out; a payload that
-        cannot be unpacked is b"".
+        """Yield messages in the order of their times of recording. Messages that cannot be read are left out;
+        a payload that cannot be unpacked is b"".
 
         Args:
             numbers: Numbers of the channels that are read.
             start_ns: Earlier times of recording [ns] are left out; None for none.
-            losses: Dict from reasons to numbers of messages that cannot be read; increased in place.
+            losses: Dict from reasons to numbers; messages that cannot be read are added as `unreadable`.
 
         Raises:
             SourceError: The file cannot be read.
         """
-        raise NotImplementedError
+        first = 0 if start_ns is None else int(np.searchsorted(self.index[:, 1], start_ns))
+        for row in first + np.flatnonzero(np.isin(self.index[first:, 0], list(numbers))):
+            number, log_ns, place = self.index[row].tolist()
+            message = self._message(number, log_ns, place)
+            if message is None:
+                count_loss(losses, self.unreadable)
+            else:
+                yield replace(message, payload=plain(message.payload))
 
     def attachment(self, name: str, limit: int) -> bytes | None:
         """Return the bytes of a file attached to the recording, None when there is none of this name.
@@ -118,35 +125,6 @@ class Container:
 
     def close(self) -> None:
         """Close the files; safe to call twice."""
-
-
-class IndexedContainer(Container):
-    """A recording with an index of all its messages. A format calls `_set_index` and implements
-    `_message`."""
-
-    #: What is counted for a message whose bytes cannot be read.
-    unreadable: str
-
-    def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of the last message but two of some channels [ns], of the first one if there are
-        fewer; 0 if there is none."""
-        rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
-        return int(self.index[rows[-TAIL:][0], 1]) if len(rows) else 0
-
-    def messages(
-        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
-    ) -> Iterator[Message]:
-        """Yield the messages of some channels in the order of their times of recording, from `start_ns` [ns]
-        on (None: all). Those that cannot be read are counted in `losses` as `unreadable`; a payload that
-        cannot be unpacked is b"". SourceError if the file cannot be read."""
-        first = 0 if start_ns is None else int(np.searchsorted(self.index[:, 1], start_ns))
-        for row in first + np.flatnonzero(np.isin(self.index[first:, 0], list(numbers))):
-            number, log_ns, place = self.index[row].tolist()
-            message = self._message(number, log_ns, place)
-            if message is None:
-                count_loss(losses, self.unreadable)
-            else:
-                yield replace(message, payload=plain(message.payload))
 
     def _set_index(self, channels: Iterable[Channel], index: Int) -> None:
         """Store the channels, with their numbers of messages, and the index, sorted by time.
@@ -180,7 +158,7 @@ def shift_after_steps(index: Int) -> int:
     channel before; the times then continue behind all messages before.
 
     Args:
-        index: As in `IndexedContainer._set_index`; its times are changed in place.
+        index: As in `Container._set_index`; its times are changed in place.
     """
     channel, time = index[:, 0], index[:, 1]
     for steps in range(MOST_STEPS):
@@ -304,7 +282,7 @@ class Chunk:
     index_is_whole: bool = True
 
 
-class ChunkedFile(IndexedContainer):
+class ChunkedFile(Container):
     """A file with messages in compressed chunks.
 
     The headers of all records are read, so a file that was cut during a recording gives all its whole chunks.

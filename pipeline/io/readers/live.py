@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import (
@@ -51,31 +52,15 @@ class MessageList(Container):
     """Messages in memory as a container."""
 
     def __init__(self, kind: str, channels: Sequence[Channel], messages: Sequence[Message]) -> None:
-        """Count the messages by channel; the messages are not copied.
+        """Index the messages, which are not copied."""
+        self.kind, self.damage, self._messages = kind, {}, messages
+        rows = [(message.channel, message.log_ns, k) for k, message in enumerate(messages)]
+        self._set_index(channels, np.array(rows, np.int64).reshape(-1, 3))
 
-        Raises:
-            KeyError: A message is of another channel.
-        """
-        self.kind, self.damage = kind, {}
-        self._messages = messages
-        counts = {channel.number: 0 for channel in channels}
-        for message in messages:
-            counts[message.channel] += 1
-        self.channels = [replace(channel, count=counts[channel.number]) for channel in channels]
-
-    def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of the last message of some channels [ns], 0 if there is none."""
-        return max((m.log_ns for m in self._messages if m.channel in numbers), default=0)
-
-    def messages(
-        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
-    ) -> Iterator[Message]:
-        """Yield the messages of some channels in their order, without those recorded before `start_ns` [ns]
-        (None: all). `losses` is unchanged."""
-        del losses
-        for message in self._messages:
-            if message.channel in numbers and (start_ns is None or message.log_ns >= start_ns):
-                yield message
+    def _message(self, number: int, log_ns: int, place: int) -> Message:
+        """Return the message with the index `place`."""
+        del number, log_ns
+        return self._messages[place]
 
 
 class ArrivalReader:

@@ -21,7 +21,7 @@ from pipeline.io.readers.container import (
     Channel,
     Chunk,
     ChunkedFile,
-    IndexedContainer,
+    Container,
     Message,
     damaged,
     ros2_type_name,
@@ -36,7 +36,7 @@ MESSAGE_LIMIT = 256 << 20
 _STRIDE = 1 << 40
 
 
-class Db3File(IndexedContainer):
+class Db3File(Container):
     """A SQLite bag as a container of messages. The file is opened for reading only.
 
     Raises:
@@ -170,7 +170,7 @@ def _natural(path: Path) -> tuple[int, str]:
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
 
 
-class BagFolder(IndexedContainer):
+class BagFolder(Container):
     """The files of a recording as one container of messages.
 
     Args:
@@ -190,7 +190,7 @@ class BagFolder(IndexedContainer):
             SourceError: None of the files can be read.
         """
         self.damage = {}
-        self._parts: list[IndexedContainer] = []
+        self._parts: list[Container] = []
         for path in files:
             try:
                 self._parts.append(open_bag(path))
@@ -366,7 +366,7 @@ def _fields(header: bytes) -> Header:
     return fields
 
 
-def open_bag(path: Path) -> IndexedContainer:
+def open_bag(path: Path) -> Container:
     """Open a file of recorded messages by its contents: SQLite, else a ROS 1 bag, else MCAP.
 
     Raises:
