@@ -29,60 +29,28 @@ def match(found: Float, truth: Float, distance_max: float) -> Int:
         distance_max: Maximum distance of a pair [m].
     """
     from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    truth_of = np.full(len(found), -1, np.int64)
-    rows, columns = _near(found, truth, distance_max)
-    if not len(rows):
-        return truth_of
-    # Groups that share no allowed pair are independent problems. Solving them one by one takes milliseconds
-    # for thousands of trees; the time for one matrix of all trees grows with the cube of their number.
-    size = len(found) + len(truth)
-    graph = coo_array((np.ones(len(rows), np.bool_), (rows, columns + len(found))), shape=(size, size))
-    _, group_of = connected_components(graph, directed=False)
-    group = group_of[rows]
-    order = np.argsort(group, kind="stable")
-    for part in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-        _solve(found, truth, distance_max, rows[part], columns[part], truth_of)
-    return truth_of
-
-
-def _near(found: Float, truth: Float, distance_max: float) -> tuple[Int, Int]:
-    """Return rows of `found` and of `truth` for all pairs within `distance_max` [m], int64, shape (K,) each.
-    A position that is not finite has no pair."""
+    from scipy.sparse.csgraph import min_weight_full_bipartite_matching
     from scipy.spatial import cKDTree
 
+    truth_of = np.full(len(found), -1, np.int64)
     mine, others = (np.flatnonzero(np.isfinite(each).all(axis=1)) for each in (found, truth))
     if not len(mine) or not len(others):
-        return mine[:0], mine[:0]
+        return truth_of
     reach = distance_max * (1.0 + 1e-9)  # scipy rounds the distance in another way
     pairs = cKDTree(found[mine]).sparse_distance_matrix(cKDTree(truth[others]), reach, output_type="ndarray")
-    rows, columns = mine[pairs["i"]], others[pairs["j"]]
-    near = np.hypot(*(found[rows] - truth[columns]).T) <= distance_max
-    return rows[near], columns[near]
-
-
-def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: Int, truth_of: Int) -> None:
-    """Assign one group of positions, and write the rows of `truth` into `truth_of`.
-
-    Args:
-        found, truth: All positions, shape (N, 2) and (M, 2) [m].
-        distance_max: Maximum distance of a pair [m].
-        rows, columns: Allowed pairs of the group: rows of `found` and of `truth`.
-        truth_of: Result, shape (N,), modified in place.
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    if len(rows) == 1:
-        truth_of[rows] = columns
-        return
-    mine, others = np.unique(rows), np.unique(columns)
-    distance = np.hypot(*(found[mine][:, None, :] - truth[others][None, :, :]).transpose(2, 0, 1))
-    # One forbidden pair costs more than all allowed pairs together.
-    forbidden = (min(len(mine), len(others)) + 1) * distance_max
-    chosen, partner = linear_sum_assignment(np.where(distance <= distance_max, distance, forbidden))
-    good = distance[chosen, partner] <= distance_max
-    truth_of[mine[chosen[good]]] = others[partner[good]]
+    row, column = pairs["i"], pairs["j"]
+    distance = np.hypot(*(found[mine[row]] - truth[others[column]]).T)
+    near = distance <= distance_max
+    # Each position may also stay alone, which costs more than all pairs together. A cost of 0 would be no
+    # entry of the sparse matrix, so all costs are increased by the same amount.
+    alone = np.arange(len(mine))
+    cost = np.append(distance[near], np.full(len(mine), (min(len(mine), len(others)) + 1) * distance_max))
+    entries = np.append(row[near], alone), np.append(column[near], len(others) + alone)
+    graph = coo_array((cost + distance_max, entries), shape=(len(mine), len(others) + len(mine)))
+    chosen, partner = min_weight_full_bipartite_matching(graph.tocsr())
+    paired = partner < len(others)
+    truth_of[mine[chosen[paired]]] = others[partner[paired]]
+    return truth_of
 
 
 # A ground truth is doubtful if less than this share of at least so many trees matches.
