@@ -22,8 +22,9 @@ from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
 from pipeline.slam.places import Places
 from pipeline.tracking.observation import SECTORS
+from pipeline.tracking.track_classification import nearest_other
 from pipeline.tracking.track_table import NO_LANDMARK, TrackTable, join
-from pipeline.types.records import Bool, Columns, Int, Verdict
+from pipeline.types.records import Columns, Int, Verdict
 
 GATE = 5.0  # sigma; largest distance of observations of one tree
 MOST_RETURNS = 20  # of a voxel of the second map
@@ -242,20 +243,8 @@ def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
     axis = b.axis.copy()
     axis[:, :2] = T.apply(b.axis[:, :2])
     axis[:, 2:4] = b.axis[:, 2:4] @ T.rotation().T
-    new = _apart(axis[:, :2], a.axis[:, :2])
+    new = nearest_other(axis, a.axis, SAME) < 0
     names = [f.name for f in fields(Columns) if f.name not in ("tile", "axis")]
     joined = {name: np.concatenate([getattr(a, name), getattr(b, name)[new]]) for name in names}
     tile = np.floor(axis[new, :2] / TILE).astype(np.int64)
     return Columns(tile=np.concatenate([a.tile, tile]), axis=np.concatenate([a.axis, axis[new]]), **joined)
-
-
-def _apart(place: Float, other: Float) -> Bool:
-    """Return which positions `place`, shape (N, 2) [m], are more than SAME from all positions `other`, shape
-    (M, 2) [m]; shape (N,). All are if `other` is empty."""
-    from scipy.spatial import cKDTree
-
-    if not len(place) or not len(other):
-        return np.ones(len(place), np.bool_)
-    distance, _ = cKDTree(other).query(place)
-    apart: Bool = distance > SAME
-    return apart
