@@ -5,11 +5,13 @@ This module needs no compiled kernel, so that a URI is parsed quickly.
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 from urllib.parse import parse_qsl
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from pipeline.errors import UsageError
 
@@ -258,23 +260,19 @@ QUALITIES = {
 SCHEME = "sim:"
 EXACT = "exact"
 CLOUD = "cloud"
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
-_COMMON_KEYS = {
-    "seed": "0 to 2^63 - 1",
-    "sigma": "range noise in metres, 0 to 0.2",
-    "odometry": f"one of {', '.join([*QUALITIES, EXACT])}",
-    "duration": "seconds, 1 to 3600",
+#: Options of a run: type with bounds, and meaning. Times and sizes are decimal numbers without a sign.
+_OPTIONS: dict[str, tuple[Any, str]] = {
+    "seed": (Annotated[int, Meta(ge=0, le=2**63 - 1)], "0 to 2^63 - 1"),
+    "sigma": (Annotated[float, Meta(ge=0.0, le=0.2)], "range noise in metres, 0 to 0.2"),
+    "odometry": (str, f"one of {', '.join([*QUALITIES, EXACT])}"),
+    "duration": (Annotated[float, Meta(ge=1.0, le=3600.0)], "seconds, 1 to 3600"),
+    "trees": (Annotated[int, Meta(ge=0, le=2000)], "how many, 0 to 2000"),
+    "drive": (Annotated[int, Meta(ge=0, le=1000)], "another drive through the same scene, 0 to 1000"),
+    "file": (str, "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd"),
+    "truth": (str, "a table (CSV) of its trees in the coordinates of the cloud"),
 }
-_KEYS = {
-    **_COMMON_KEYS,
-    "trees": "how many, 0 to 2000",
-    "drive": "another drive through the same scene, 0 to 1000",
-}
-_CLOUD_KEYS = {
-    "file": "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd",
-    "truth": "a table (CSV) of its trees in the coordinates of the cloud",
-    **_COMMON_KEYS,
-}
+_KEYS = ("seed", "sigma", "odometry", "duration", "trees", "drive")
+_CLOUD_KEYS = ("file", "truth", "seed", "sigma", "odometry", "duration")
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,65 +327,68 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
     if name != CLOUD and name not in SCENARIOS:
         known = ", ".join(SCHEME + scenario for scenario in SCENARIOS)
         raise UsageError(f"there is no scenario {name!r}", where=uri, remedy=f"Scenarios: {known}")
-    values = _pairs(uri, query, _CLOUD_KEYS if name == CLOUD else _KEYS)
-    if name == CLOUD and not values.get("file"):
+    scenario = None if name == CLOUD else SCENARIOS[name]
+    values = _values(uri, query, _KEYS if scenario else _CLOUD_KEYS)
+    if scenario is None and not values.get("file"):
         raise UsageError(
             "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
         )
-    odometry = values.get("odometry", "normal" if name == CLOUD else SCENARIOS[name].odometry)
+    odometry = values.get("odometry", scenario.odometry if scenario else "normal")
     if odometry not in (*QUALITIES, EXACT):
         raise _refusal(uri, "odometry", odometry)
-    scenario = None if name == CLOUD else SCENARIOS[name]
-    trees, most = (
-        (0, 0) if scenario is None else (scenario.trees, scenario.trees if scenario.placed else 2000)
-    )
-    duration_s = 0.0 if scenario is None else scenario.duration_s
-    if "duration" in values:
-        duration_s = _real(uri, "duration", values["duration"], 1.0, 3600.0)
+    trees = values.get("trees", scenario.trees if scenario else 0)
+    if scenario and scenario.placed and trees > scenario.trees:
+        remedy = f"This scenario has at most {scenario.trees} trees"
+        raise UsageError(_refusal(uri, "trees", str(trees)).what, where=uri, remedy=remedy)
     return RunRequest(
         name=name,
-        seed=_whole(uri, "seed", values.get("seed", str(seed)), 2**63 - 1),
-        sigma=_real(uri, "sigma", values.get("sigma", "0.02"), 0.0, 0.2),
+        seed=values["seed"] if "seed" in values else _value(uri, "seed", str(seed)),
+        sigma=values.get("sigma", 0.02),
         odometry=odometry,
-        duration_s=duration_s,
-        trees=_whole(uri, "trees", values.get("trees", str(trees)), most),
-        drive=_whole(uri, "drive", values.get("drive", "0"), 1000),
+        duration_s=values.get("duration", scenario.duration_s if scenario else 0.0),
+        trees=trees,
+        drive=values.get("drive", 0),
         file=values.get("file", ""),
         truth=values.get("truth", ""),
     )
 
 
-def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
-    """Return a dict from the keys to the decoded values ("+" is a space) of the options of a URI; empty for
-    an empty query. A value may be empty.
+def _values(uri: str, query: str, keys: tuple[str, ...]) -> dict[str, Any]:
+    """Return a dict from the keys to the values of the options of a URI, with the types of _OPTIONS; empty
+    for an empty query. In texts "+" is a space; they may be empty.
 
     Args:
         uri: The URI, for errors.
         query: Part of the URI after "?", percent-encoded.
-        keys: Dict from valid keys to descriptions of their values.
+        keys: Valid keys.
 
     Raises:
-        UsageError: The query is not key=value pairs, or a key is unknown or given twice.
+        UsageError: The query is not key=value pairs, a key is unknown or given twice, or a value has another
+            type or is out of bounds.
     """
+    allowed = "Options: " + "; ".join(f"{key} ({_OPTIONS[key][1]})" for key in keys)
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
     except ValueError:
         raise UsageError(
-            "the part after ? must be key=value, joined by &", where=uri, remedy=_allowed(keys)
+            "the part after ? must be key=value, joined by &", where=uri, remedy=allowed
         ) from None
-    values: dict[str, str] = {}
-    for key, value in pairs:
+    values: dict[str, Any] = {}
+    for key, text in pairs:
         if key not in keys:
-            raise UsageError(f"a simulated run has no option {key!r}", where=uri, remedy=_allowed(keys))
+            raise UsageError(f"a simulated run has no option {key!r}", where=uri, remedy=allowed)
         if key in values:
             raise UsageError(f"option {key!r} is given twice", where=uri, remedy="Give it once")
-        values[key] = value
+        values[key] = _value(uri, key, text)
     return values
 
 
-def _allowed(keys: dict[str, str]) -> str:
-    """Return the text "Options: ..." with all keys and what their values mean."""
-    return "Options: " + "; ".join(f"{key} ({meaning})" for key, meaning in keys.items())
+def _value(uri: str, key: str, text: str) -> Any:  # noqa: ANN401 - of the type of the option
+    """Return the value of an option; UsageError if the text has another type or is out of bounds."""
+    try:
+        return msgspec.convert(text, _OPTIONS[key][0], strict=False)
+    except msgspec.ValidationError:
+        raise _refusal(uri, key, text) from None
 
 
 def _refusal(uri: str, key: str, text: str) -> UsageError:
@@ -395,48 +396,7 @@ def _refusal(uri: str, key: str, text: str) -> UsageError:
 
     Args:
         uri: The URI, for the message.
-        key: Name of the option, one of `_KEYS`.
+        key: Name of the option.
         text: Value of the option.
     """
-    return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_KEYS[key]}")
-
-
-def _whole(uri: str, key: str, text: str, most: int) -> int:
-    """Return the integer of a text, from 0 to `most`.
-
-    Args:
-        uri: The URI, for the error.
-        key: Name of the option.
-        text: Value of the option; ASCII digits only.
-        most: Maximum number.
-
-    Raises:
-        UsageError: The text is not such a number.
-    """
-    if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
-        refusal = _refusal(uri, key, text)
-        if key == "trees" and most < 2000:
-            refusal = UsageError(refusal.what, where=uri, remedy=f"This scenario has at most {most} trees")
-        raise refusal
-    return int(text)
-
-
-def _real(uri: str, key: str, text: str, low: float, high: float) -> float:
-    """Return a decimal number from `low` to `high`, both inclusive.
-
-    Args:
-        uri: The URI, for the error.
-        key: Name of the option.
-        text: Value of the option, less than 40 characters; ASCII digits only, an exponent is allowed.
-        low, high: Bounds.
-
-    Raises:
-        UsageError: The text is not such a number.
-    """
-    # float() alone would also take 1_0, spaces and digits of other scripts.
-    if not (len(text) < 40 and _NUMBER.fullmatch(text)):
-        raise _refusal(uri, key, text)
-    value = float(text)
-    if not low <= value <= high:
-        raise _refusal(uri, key, text)
-    return value
+    return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_OPTIONS[key][1]}")
