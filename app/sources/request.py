@@ -17,7 +17,12 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import Source
 from pipeline.io.readers.base import SourceDescription, SourceOptions
-from pipeline.odometry.odometry_override import OdometryEstimator, OdometryOverride
+from pipeline.odometry.odometry_override import (
+    FileOdometry,
+    LidarOdometry,
+    OdometryEstimator,
+    OdometryOverride,
+)
 from pipeline.odometry.synchroniser import OdometryChoice
 
 Role = Literal["scan", "odometry", "imu", "gnss", "pose", "camera"]
@@ -219,12 +224,8 @@ def motion_of(known: SourceDescription, choice: str, chosen: ChosenOdometry) -> 
         SourceError: A pose file cannot be read.
     """
     if chosen.method == "kiss-icp":
-        from pipeline.odometry.lidar_odometry import LidarOdometry
-
         return LidarOdometry(known.T_base_lidar)
     if chosen.method == "file":
-        from pipeline.odometry.odometry_override import FileOdometry
-
         return FileOdometry(Path(choice.removeprefix(FILE)).expanduser(), known.T_base_lidar)
     return None
 

@@ -20,8 +20,7 @@ from pipeline.io.readers import open_source
 from pipeline.io.readers.base import Source
 from pipeline.io.readers.pose_files import between
 from pipeline.io.readers.simulated import SimulatedSource
-from pipeline.odometry.lidar_odometry import undistorted
-from pipeline.odometry.odometry_override import TOO_FEW, TOO_MANY
+from pipeline.odometry.odometry_override import TOO_FEW, TOO_MANY, LidarOdometry, undistorted
 from pipeline.types.records import Odometry, Record, Scan, Sensor
 from tests.pipeline.io.test_kitti import curve, matrices
 from tests.pipeline.io.test_scan_folders import tum, write
@@ -187,8 +186,6 @@ def test_points_are_moved_by_the_step_to_the_stamp():
 def test_too_few_points_give_no_pose():
     source = without_wheels()
     moving, _ = with_odometry(source, "kiss-icp")
-    from pipeline.odometry.lidar_odometry import LidarOdometry
-
     motion = LidarOdometry(Pose3.identity())
     few = Scan(1, np.ones((5, 3), np.float32))
     assert list(motion.add(few)) == [few]
