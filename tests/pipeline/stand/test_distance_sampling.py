@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.stand.distance_sampling import CERTAIN, fit_half_normal
+from pipeline.stand.plots import CERTAIN, fit_half_normal
 
 
 def fitted(distance, available):
