@@ -20,10 +20,19 @@ from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
 from pipeline.inventory.cloud import ExtentFinder, SpooledCloud, Thinned
-from pipeline.inventory.cross_sections import FIGURES, HIGHEST, LOWEST, Slices, cut, slice_heights
+from pipeline.inventory.cross_sections import (
+    FIGURES,
+    HIGHEST,
+    LOWEST,
+    Slices,
+    cut,
+    find_columns,
+    slice_heights,
+    strongest_first,
+    trace,
+)
 from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of, without_heights
 from pipeline.inventory.stem_model import Stems, classify_stems, describe_stems, diameters, is_repeated
-from pipeline.inventory.stem_tracing import find_columns, strongest_first, trace
 from pipeline.inventory.terrain_raster import LowestReturns, TerrainRaster, heights_above
 from pipeline.types.records import Float32, Int, Int32, Trees, Verdict, WholeCloud
 

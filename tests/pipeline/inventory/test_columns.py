@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.inventory.cross_sections import find_columns, strongest_first
 from pipeline.inventory.stem_model import STEM, is_repeated
-from pipeline.inventory.stem_tracing import find_columns, strongest_first
 from pipeline.types.records import Verdict
 from tests.pipeline.inventory.plots import stem
 
