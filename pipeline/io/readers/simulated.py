@@ -100,6 +100,21 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
     return SimulatedSource(uri, open_run(request, chosen.T_base_lidar))
 
 
+def open_cloud_drive(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
+    """Open a whole cloud as a run: a simulated robot drives through it, as for `sim:cloud?file=`.
+
+    Args:
+        uri: Path as the user wrote it.
+        file: File of the cloud.
+        options: Choices of the user, of which seed and extrinsics are used.
+
+    Raises:
+        SourceError: The cloud cannot be read, or has no path for a robot.
+    """
+    request = parse_uri(f"{SCHEME}{CLOUD}?{urlencode({'file': str(file)})}", options.seed)
+    return _open_cloud(uri, request, options)
+
+
 def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> SimulatedSource:
     """Open a drive through the real cloud of a plot.
 
@@ -116,31 +131,12 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
     from pipeline.simulation.cloud_run import open_cloud_run
 
     trees = read_truth_trees(Path(request.truth).expanduser()) if request.truth else None
-    run = open_cloud_run(request, open_cloud(request.file), trees, options.T_base_lidar)
-    return SimulatedSource(uri, run, knows_trees=trees is not None, warnings=run.warnings)
-
-
-def open_cloud_drive(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
-    """Open a whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
-
-    Args:
-        uri: Path as the user wrote it.
-        file: File of the cloud.
-        options: Choices of the user, of which seed and extrinsics are used.
-
-    Raises:
-        SourceError: The cloud cannot be read, or has no path for a robot.
-    """
-    from pipeline.io.readers.clouds import open_cloud
-    from pipeline.simulation.cloud_run import open_cloud_run
-
-    request = parse_uri(f"{SCHEME}{CLOUD}?{urlencode({'file': str(file)})}", options.seed)
-    cloud = open_cloud(str(file))
+    cloud = open_cloud(request.file)
     try:
-        run = open_cloud_run(request, cloud, None, options.T_base_lidar)
+        run = open_cloud_run(request, cloud, trees, options.T_base_lidar)
     except SourceError as error:
         raise SourceError(
             error.what, where=uri, remedy="`stemmap map` maps the cloud as a whole, without a robot"
         ) from None
     kind = f"simulated drive through a whole cloud ({cloud.description.kind})"
-    return SimulatedSource(uri, run, knows_trees=False, kind=kind, warnings=run.warnings)
+    return SimulatedSource(uri, run, knows_trees=trees is not None, kind=kind, warnings=run.warnings)
