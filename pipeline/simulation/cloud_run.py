@@ -308,7 +308,7 @@ def open_cloud_run(
         raise SourceError("the cloud has no points", where=cloud.description.uri)
     way = loop_through(points, ground, cloud.description.uri)
     course = lay_course(way, closed=True)
-    heading = _heading(way)
+    heading = course.heading
     start = np.append(way[0], ground.at(way[:1, 0], way[:1, 1]))
     lap = float(np.ceil(lap_time(course, SPEED)))
     duration = request.duration_s or min(max(lap, SHORTEST), LONGEST)
@@ -341,17 +341,6 @@ def _cut_short(way: float, lap: float) -> tuple[str]:
     """
     drives = f"duration={lap:.0f} drives all of it" if lap <= 3600.0 else "duration=3600 drives most of it"
     return (f"the loop through the plot is {way:.0f} m long, of which {LONGEST:.0f} s are driven: {drives}",)
-
-
-def _heading(way: Float) -> float:
-    """Return the heading of the smooth line through a closed row of waypoints, shape (N, 2) [m], at the first
-    one [rad]."""
-    from scipy.interpolate import CubicSpline
-
-    knots = np.vstack([way, way[:1]])
-    chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(knots, axis=0).T))])
-    ahead = CubicSpline(chord, knots, bc_type="periodic")(0.0, 1)
-    return float(np.arctan2(ahead[1], ahead[0]))
 
 
 def _from(points: Float32, start: Float, yaw: float) -> Float32:

@@ -176,7 +176,8 @@ class Drive:
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
     """The course in the plane, sampled every 2 cm, as columns of length N: distance s, x, y [m], yaw [rad]
-    and curvature [1/m]. It begins at the origin along x; `yaw` is continuous."""
+    and curvature [1/m]. It begins at the origin along x; `yaw` is continuous. `heading` is the direction of
+    its begin in the frame of the waypoints [rad]."""
 
     s: Float
     x: Float
@@ -184,6 +185,7 @@ class Course:
     yaw: Float
     curvature: Float
     closed: bool
+    heading: float
 
 
 def lay_course(waypoints: Float, closed: bool) -> Course:
@@ -209,7 +211,7 @@ def lay_course(waypoints: Float, closed: bool) -> Course:
     curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / norm**3
     c, sn = np.cos(yaw[0]), np.sin(yaw[0])
     x, y = (xy - xy[0]).T
-    return Course(s, c * x + sn * y, c * y - sn * x, yaw - yaw[0], curvature, closed)
+    return Course(s, c * x + sn * y, c * y - sn * x, yaw - yaw[0], curvature, closed, float(yaw[0]))
 
 
 def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
