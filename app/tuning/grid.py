@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs
-from pipeline.config.model import Value
-from pipeline.config.text import parsed, toml_table, value_text
+from pipeline.config.model import Value, parsed, toml_table, value_text
 from pipeline.errors import ParameterError
 
 PRESET = "preset"  # the axis whose values are names of presets, which the other axes change

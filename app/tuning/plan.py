@@ -14,8 +14,7 @@ from app.sources.request import SourceRequest
 from app.store.records import Content
 from app.tuning.grid import checked_value, grid_axis, spec_of
 from pipeline.config import FieldSpec, Parameters
-from pipeline.config.model import Value, validated
-from pipeline.config.text import value_text
+from pipeline.config.model import Value, validated, value_text
 from pipeline.errors import ParameterError
 from pipeline.evaluation import MapScores
 

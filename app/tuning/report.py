@@ -22,8 +22,7 @@ from app.tuning.grid import PRESET, words_of
 from app.tuning.jobs import Job, JobResult, ScoringProcesses
 from app.tuning.scoring import PreparedRun
 from pipeline.config import Parameters
-from pipeline.config.model import Value, validated
-from pipeline.config.text import value_text
+from pipeline.config.model import Value, validated, value_text
 from pipeline.errors import ParameterError
 from pipeline.evaluation import MapScores
 from pipeline.io.atomic_files import write_texts

@@ -14,7 +14,7 @@ from app.common.text import count, version
 from app.dashboard.parameters import file_of
 from app.tuning.plan import Goal, Plan, Trial, pool
 from pipeline.config import Parameters
-from pipeline.config.text import value_text
+from pipeline.config.model import value_text
 from pipeline.errors import StemmapError
 from pipeline.evaluation import MapScores
 

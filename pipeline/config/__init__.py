@@ -3,10 +3,19 @@
 The sliders, the REST schema, `--set stage.name=value`, the TOML file and docs/parameters.md derive from it.
 """
 
-from pipeline.config.model import FieldSpec, Parameters, RenamedParameterWarning, current_names, field_specs
+from pipeline.config.model import (
+    FieldSpec,
+    Parameters,
+    RenamedParameterWarning,
+    assign,
+    current_names,
+    field_specs,
+    from_toml,
+    markdown_table,
+    to_toml,
+)
 from pipeline.config.presets import PRESETS, preset
 from pipeline.config.stages import Stage
-from pipeline.config.text import assign, from_toml, markdown_table, to_toml
 
 __all__ = [
     "PRESETS",

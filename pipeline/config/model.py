@@ -1,12 +1,15 @@
-"""The set of all parameters, its validation, and a description of each field."""
+"""The set of all parameters, its validation, a description of each field, and parameters as text:
+`stage.name=value`, TOML, and the table in docs/parameters.md."""
 
 from __future__ import annotations
 
 import difflib
+import re
+import tomllib
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -218,6 +221,15 @@ class FieldSpec:
     default: Value
 
 
+#: Kind of the other parameters by the type of their values.
+_KINDS: dict[Any, Literal["float", "int", "bool", "choice", "name"]] = {
+    float: "float",
+    int: "int",
+    bool: "bool",
+    str: "name",
+}
+
+
 def field_specs() -> tuple[FieldSpec, ...]:
     """Return the description of every parameter, in the order of the stages."""
     return tuple(
@@ -251,18 +263,7 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     bounds = {type(m).__name__: m for m in field.metadata}
     minimum, maximum = bounds.get("Ge"), bounds.get("Le")
-    kind: Literal["float", "int", "bool", "choice", "name"]
-    choices: tuple[str, ...] = ()
-    if get_origin(field.annotation) is Literal:
-        kind, choices = "choice", get_args(field.annotation)
-    elif field.annotation is bool:
-        kind = "bool"
-    elif field.annotation is int:
-        kind = "int"
-    elif field.annotation is str:
-        kind = "name"
-    else:
-        kind = "float"
+    choices = get_args(field.annotation)
     step, shown = extra.get("step"), extra.get("shown")
     low, high = (float(str(end)) for end in shown) if isinstance(shown, list) else (0.0, 0.0)  # of a number
     return FieldSpec(
@@ -271,7 +272,7 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
         title=field.title or name,
         unit=str(extra.get("unit", "")),
         doc=" ".join((field.description or "").split()),
-        kind=kind,
+        kind="choice" if choices else _KINDS[field.annotation],
         minimum=None if minimum is None else float(minimum.ge),
         maximum=None if maximum is None else float(maximum.le),
         step=None if not isinstance(step, int | float) else float(step),
@@ -281,3 +282,147 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
         choices=choices,
         default=field.default,
     )
+
+
+# --- as text ---
+
+LONGEST_TOML = 1_000_000  # characters
+#: A name of more parts: tomllib takes gigabytes for names of thousands of parts.
+_DEEP_NAME = re.compile(r"(?:\.[^.,=\n]{0,100}){20}")
+
+
+def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
+    """Return parameters changed by `stage.name=value` texts of the command line. Spaces around name and value
+    are ignored; of two texts with one name the later one counts. Names of earlier versions give a
+    RenamedParameterWarning, and removed parameters are ignored with such a warning, see `current_names`.
+
+    Raises:
+        ParameterError: A text has no "=", a name is unknown, or a value is not valid.
+    """
+    specs = {spec.name: spec for spec in field_specs()}
+    changes: dict[str, str] = {}
+    for text in assignments:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not equals:
+            raise ParameterError(f"{text!r} is not stage.name=value", remedy="E.g. --set clustering.eps=0.3")
+        changes[name] = value
+    return parameters.replace(
+        {
+            name: parsed(specs[name], value) if name in specs else value
+            for name, value in current_names(changes).items()
+        }
+    )
+
+
+def value_text(value: Value) -> str:
+    """Return the value of a parameter in the syntax of `--set`, for example "0.2", "true" or "dbscan". Floats
+    have up to six significant digits."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def parsed(spec: FieldSpec, text: str) -> Value:
+    """Return the value of a parameter from its text; bounds and choices are not checked, and "nan" and "inf"
+    are numbers of type float. The text of a bool other than "true" and "false" is returned unchanged.
+
+    Raises:
+        ParameterError: The text of a numeric parameter is not a number.
+    """
+    try:
+        if spec.kind == "int":
+            return int(text)
+        if spec.kind == "float":
+            return float(text)
+    except ValueError:
+        kind = "a whole number" if spec.kind == "int" else "a number"
+        raise ParameterError(f"{spec.name} = {text!r}: should be {kind}") from None
+    if spec.kind == "bool" and text in ("true", "false"):
+        return text == "true"
+    return text
+
+
+def to_toml(parameters: Parameters) -> str:
+    """Return all values, also those equal to a default, as TOML text with one table per stage, in the order
+    of the stages."""
+    import tomli_w
+
+    return tomli_w.dumps(parameters.model_dump())
+
+
+def from_toml(text: str, base: Parameters, where: str) -> Parameters:
+    """Return the base set with the values of a TOML text; the text may omit stages and values. Names of
+    earlier versions give a RenamedParameterWarning, and removed parameters are ignored with such a warning,
+    see `current_names`.
+
+    Args:
+        text: Content of the file.
+        base: Values of the parameters that the text omits; not changed.
+        where: Name of the file, for error messages.
+
+    Raises:
+        ParameterError: The text is not TOML (see `toml_table`), a value is not in a table, a name is unknown,
+            or a value is not valid.
+    """
+    given = toml_table(text, where)
+    for stage, values in given.items():
+        if not isinstance(values, dict):
+            raise ParameterError(
+                f"{stage} is not inside a stage", where=where, remedy="Write it below a line [stage]"
+            )
+    values = current_names({f"{stage}.{name}": v for stage, vs in given.items() for name, v in vs.items()})
+    tree: dict[str, Any] = base.model_dump()
+    for dotted, value in values.items():
+        stage, _, name = dotted.partition(".")
+        # TOML distinguishes 1 from 1.0; both are valid for a floating-point parameter.
+        tree.setdefault(stage, {})[name] = value
+    try:
+        return validated(tree)
+    except ParameterError as error:
+        raise ParameterError(error.what, where=where) from None
+
+
+def toml_table(text: str, where: str) -> dict[str, Any]:
+    """Return the top-level table of a TOML text as a dict, without a check of names and values.
+
+    Args:
+        text: Content of the file.
+        where: Name of the file, for error messages.
+
+    Raises:
+        ParameterError: The text is not TOML, is longer than LONGEST_TOML, or has names of too many parts.
+    """
+    if len(text) > LONGEST_TOML:
+        raise ParameterError(f"the file is longer than {LONGEST_TOML:,} characters", where=where)
+    if _DEEP_NAME.search(text):
+        raise ParameterError("a name in the file has too many parts", where=where)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError
+        raise ParameterError(f"not a TOML file: {error}", where=where) from None
+
+
+def markdown_table(presets: dict[str, Parameters]) -> str:
+    """Return a Markdown table of every parameter with unit, bounds, its value in each preset, and meaning;
+    one row per parameter, with a final line break.
+
+    Args:
+        presets: Dict from names of presets to their parameters; each gives a column.
+    """
+    values = {name: parameters.flat() for name, parameters in presets.items()}
+    head = ["parameter", "unit", "bounds", *(f"`{name}`" for name in presets), "meaning"]
+    rows = [
+        [f"`{s.name}`", s.unit, _bounds(s), *(value_text(values[p][s.name]) for p in presets), s.doc]
+        for s in field_specs()
+    ]
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines) + "\n"
+
+
+def _bounds(spec: FieldSpec) -> str:
+    """Return the bounds of a number as "low to high", else the choices, "true, false" or "a name"."""
+    if spec.kind == "name":
+        return "a name"
+    if spec.minimum is None or spec.maximum is None:
+        return ", ".join(spec.choices) or "true, false"
+    return f"{spec.minimum:g} to {spec.maximum:g}"

@@ -20,7 +20,7 @@ from pipeline.config import (
     preset,
     to_toml,
 )
-from pipeline.config.text import toml_table
+from pipeline.config.model import toml_table, value_text
 from pipeline.errors import ParameterError
 
 SPECS = field_specs()
@@ -302,7 +302,7 @@ def test_the_table_has_a_row_per_parameter_and_a_column_per_preset():
         assert line.startswith(f"| `{spec.name}` |")
         for name in PRESETS:
             value = preset(name).flat()[spec.name]
-            assert (f"{value:g}" if isinstance(value, float) else str(value)) in line
+            assert f"| {value_text(value)} |" in line
 
 
 def test_values_are_plain_python_numbers():
