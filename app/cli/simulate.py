@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     from app.common.text import count
     from pipeline.io.atomic_files import write_texts
     from pipeline.io.readers.simulated import open_simulated
-    from pipeline.io.recording import write_recording
+    from pipeline.io.recording.mcap_writer import write_recording
     from pipeline.io.recording.rendering import CAMERA, with_pictures
     from pipeline.io.result_files import csv_text, number_text
 

@@ -27,7 +27,7 @@ from pipeline.errors import ParameterError
 from pipeline.evaluation import MapScores
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import csv_text
-from pipeline.remapping import segmentation_key
+from pipeline.remapping.rerun import segmentation_key
 
 
 @dataclass(frozen=True, slots=True)

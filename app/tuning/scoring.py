@@ -33,7 +33,7 @@ from pipeline.io.readers import is_cloud, open_source
 from pipeline.io.readers.clouds import open_cloud
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.remapping import ScanCache, ScanCaches
+from pipeline.remapping.rerun import ScanCache, ScanCaches
 from pipeline.types.records import Frame, Path, Step, Trees, TruthTrees
 
 #: Points of the scans that are held in memory [bytes]; a longer run is read again when the front end runs.

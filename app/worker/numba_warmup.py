@@ -134,7 +134,7 @@ def map_scene() -> None:
     back and a preview."""
     from pipeline.io.readers import open_source
     from pipeline.odometry.synchroniser import steps
-    from pipeline.remapping import ClusterTable, KnownMap, preview_trees
+    from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees
 
     source, parameters, clusters, columns = open_source(_SCENE), Parameters(), ClusterTable(), None
     mapper = mapper_of(source.description, parameters, seed=0)
@@ -153,7 +153,7 @@ def warm_tree_map() -> None:
     from pipeline.config import preset
     from pipeline.geometry.poses import Pose3
     from pipeline.mapper import Mapper
-    from pipeline.remapping import ClusterTable, KnownMap, preview_trees
+    from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees
     from pipeline.tracking import Tracker
     from pipeline.tracking.track_classification import tree_columns
     from pipeline.types.records import Sensor

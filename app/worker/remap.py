@@ -34,8 +34,8 @@ from pipeline.front_end import SegmentedScan
 from pipeline.geometry.columns import GrowingColumns, columns_of, rows_in_common, rows_of
 from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
-from pipeline.remapping import ClusterTable, Rerun
-from pipeline.remapping.rerun import Segment
+from pipeline.remapping.preview import ClusterTable
+from pipeline.remapping.rerun import Rerun, Segment
 from pipeline.stand.seen_area import ViewSelection
 from pipeline.types.records import Columns, Float, Float32, Frame, Path, Step, Trees, Verdict
 

@@ -37,7 +37,8 @@ from pipeline.geometry.columns import GrowingColumns, evenly_spaced
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.remapping import KnownMap, Rerun, ScanCaches, needs_sample, preview_trees, sample_scans
+from pipeline.remapping.preview import KnownMap, needs_sample, preview_trees, sample_scans
+from pipeline.remapping.rerun import Rerun, ScanCaches
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
 #: Returns a mapper of a source for parameters and a seed, see `mapper_of`.

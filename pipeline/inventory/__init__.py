@@ -354,6 +354,3 @@ def _warnings(cloud: WholeCloud, points: PlotPoints) -> tuple[str, ...]:
     if points.ground.seen.mean() < 0.1:
         warnings.append("the ground is visible in less than 10 % of the plot: heights are uncertain")
     return tuple(warnings)
-
-
-__all__ = ["PARAMETERS", "Inventory", "PlotMap", "finish", "ground_steps", "map_plot"]

@@ -193,6 +193,3 @@ def _cut_off(points: Float, column: int) -> float:
     np.maximum.at(ends, which.reshape(-1), points[:, column])
     last = float(points[:, column].max())
     return last if np.mean(ends > last - CELL) > CUT else np.inf
-
-
-__all__ = ["Crowns", "Voxels", "find_crowns", "voxels_of"]

@@ -155,7 +155,7 @@ async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) ->
 async def sources(dashboard: Dash, settings: Deployment) -> Response:
     """GET /api/sources: return an object with `scenarios`, a list of objects with `uri` and `doc`, and
     `recordings`, a list of at most 500 results of `_listed`."""
-    from pipeline.io.readers.simulated import scenarios
+    from pipeline.simulation.scenarios import scenarios
 
     try:
         uploaded = await dashboard.store.ask(lambda store: store.book.uploads())

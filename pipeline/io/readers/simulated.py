@@ -10,10 +10,8 @@ from pipeline.errors import SourceError
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions
 from pipeline.simulation.robot_motion import IMU_HZ, ODOMETRY_HZ
 from pipeline.simulation.run import START_NS, SimulatedRun, open_run
-from pipeline.simulation.scenarios import CLOUD, SCHEME, RunRequest, parse_uri, scenarios
+from pipeline.simulation.scenarios import CLOUD, SCHEME, RunRequest, parse_uri
 from pipeline.types.records import Record, Truth
-
-__all__ = ["SimulatedSource", "open_simulated", "scenarios"]
 
 _TICK_NS = 1_000_000_000 // IMU_HZ
 

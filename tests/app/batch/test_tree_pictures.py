@@ -17,7 +17,7 @@ from pipeline.io.readers import open_source
 from pipeline.io.readers.camera import nearest
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.simulated import SimulatedSource
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.io.recording.rendering import CAMERA, rendered, with_pictures
 from pipeline.types.records import Path as Way
 from pipeline.types.records import Trees, Truth, TruthTrees

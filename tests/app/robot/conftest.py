@@ -16,7 +16,7 @@ import pytest
 
 from app.robot.source import LiveSource, open_live
 from pipeline.geometry.poses import Pose3
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.types.records import Odometry, Record, Scan, Sensor
 from tests.app.robot.fast_dds import compiled
 

@@ -34,7 +34,7 @@ from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.io.readers.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.io.recording.rendering import CAMERA, with_pictures
 from pipeline.types.records import Path as Way
 from pipeline.types.records import Record, Scan, Truth

@@ -17,7 +17,7 @@ from pipeline.io.readers import open_source
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.topics import POINT_CLOUD
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.types.records import Frame
 from tests.app.robot.conftest import until
 from tests.app.robot.test_live_session import URI, FakeLink, announce

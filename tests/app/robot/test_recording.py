@@ -29,8 +29,7 @@ from pipeline.io.readers.base import Source
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.topics import POINT_CLOUD
-from pipeline.io.recording import write_recording
-from pipeline.io.recording.mcap_writer import LiveWriter, repair
+from pipeline.io.recording.mcap_writer import LiveWriter, repair, write_recording
 from pipeline.types.records import Scan
 from tests.app.robot.conftest import Child, until
 from tests.app.robot.test_live_session import FakeLink, announce

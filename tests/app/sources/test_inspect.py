@@ -28,7 +28,7 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import Source, SourceOptions
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.topics import IMAGE, NAV_SAT_FIX, POINT_CLOUD
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.types.records import Sensor
 from tests.app.batch.finished_runs import grid_run
 from tests.app.fakes import FakeSource, FakeWorker, make_mapper

@@ -30,7 +30,7 @@ from pipeline.io.readers import open_source
 from pipeline.io.readers.camera import SHOWN_NS, Picture
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.simulated import SimulatedSource
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.io.recording.rendering import CAMERA, rendered, with_pictures
 from pipeline.types.records import Frame, Truth, TruthTrees
 from tests.app.batch.test_tree_pictures import bomb, trees_at

@@ -9,7 +9,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 from pipeline.io.readers import open_source
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from tests.app.robot.conftest import Child, free_port
 from tests.benchmarks.campaign import Result
 from tests.benchmarks.campaign.service import Edits, Service, check_edits, check_recording

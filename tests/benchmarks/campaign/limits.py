@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.io.readers import open_source
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from tests.app.robot.conftest import SCANS
 from tests.app.robot.test_bad_days import SetClock, trees
 from tests.app.robot.test_recording import Played, map_files

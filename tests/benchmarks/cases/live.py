@@ -39,7 +39,7 @@ def run() -> list[Table]:
 def record_drive(place: Path) -> int:
     """Write the drive that each robot sends; the median number of points a scan."""
     from pipeline.io.readers.simulated import SimulatedSource
-    from pipeline.io.recording import write_recording
+    from pipeline.io.recording.mcap_writer import write_recording
     from pipeline.simulation.lidar import SpinningLidar
     from pipeline.simulation.run import open_run
     from pipeline.simulation.scenarios import parse_uri

@@ -59,7 +59,7 @@ def run() -> list[Table]:
 def full_disk(folder: Path) -> dict[str, Any]:
     """What a live run tells whose recording has no more room."""
     from pipeline.geometry.poses import Pose3
-    from pipeline.io.recording import write_recording
+    from pipeline.io.recording.mcap_writer import write_recording
     from pipeline.types.records import Sensor
     from tests.app.robot.conftest import Child, clouds
 
@@ -77,8 +77,7 @@ def kill_once(folder: Path, k: int, pace: str = "") -> tuple[int, int, float, bo
     a message is missing before."""
     from pipeline.io.readers import open_source
     from pipeline.io.readers.mcap_file import McapFile
-    from pipeline.io.recording import write_recording
-    from pipeline.io.recording.mcap_writer import repair
+    from pipeline.io.recording.mcap_writer import repair, write_recording
     from tests.app.robot.conftest import Child
 
     drive, out, mended = folder / "drive.mcap", folder / f"killed{k}.mcap", folder / f"mended{k}.mcap"

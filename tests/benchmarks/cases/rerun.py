@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from pipeline.config import Parameters
     from pipeline.io.readers.base import Source
     from pipeline.mapper import Mapper
-    from pipeline.remapping import KnownMap, ScanCaches
+    from pipeline.remapping.preview import KnownMap
+    from pipeline.remapping.rerun import ScanCaches
     from pipeline.types.records import Step
 
 NAME = "rerun"
@@ -38,7 +39,7 @@ def run() -> list[Table]:
     """Preset forest."""
     from pipeline.config import preset
     from pipeline.io.readers import open_source
-    from pipeline.remapping import ScanCaches
+    from pipeline.remapping.rerun import ScanCaches
 
     base, source = preset("forest"), open_source(URI)
     with closing(ScanCaches(most=8 << 30)) as caches:
@@ -91,7 +92,7 @@ def _first_run(
 ) -> tuple[list[Step], KnownMap, float]:
     """Map the run and cache its scans; returns its first scans, the map, and the seconds taken."""
     from pipeline.odometry.synchroniser import steps
-    from pipeline.remapping import ClusterTable, KnownMap
+    from pipeline.remapping.preview import ClusterTable, KnownMap
 
     mapper, cache, clusters = _mapper(source, parameters), caches.of(parameters), ClusterTable()
     held: list[Step] = []
@@ -114,7 +115,7 @@ def _rerun_s(
 ) -> float:
     """Seconds of a rerun; a short one before compiles the kernels."""
     from app.worker.remap import segment_ahead
-    from pipeline.remapping import Rerun, ScanCaches
+    from pipeline.remapping.rerun import Rerun, ScanCaches
 
     spent, reread = 0.0, None if held is None else lambda index: iter(held[index:])
     for most in (min(scans, 50), scans):
@@ -133,7 +134,7 @@ def _preview(
     words: str, known: KnownMap, parameters: Parameters, source: Source, held: list[Step]
 ) -> tuple[Cell, ...]:
     """The preview; one before compiles the kernels."""
-    from pipeline.remapping import preview_trees, sample_scans
+    from pipeline.remapping.preview import preview_trees, sample_scans
 
     segment = _mapper(source, parameters).segmenter()
     numbers = sample_scans(len(held), held[0].scan.points.nbytes)

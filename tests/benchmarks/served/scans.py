@@ -14,7 +14,7 @@ DURATION_S = 26
 def write(path: Path) -> float:
     """Write the recording; the mean number of returns of its scans."""
     from pipeline.io.readers.simulated import SimulatedSource
-    from pipeline.io.recording import write_recording
+    from pipeline.io.recording.mcap_writer import write_recording
     from pipeline.simulation.lidar import SpinningLidar
     from pipeline.simulation.run import open_run
     from pipeline.simulation.scenarios import parse_uri

@@ -17,8 +17,7 @@ from pipeline.errors import SourceError
 from pipeline.io.ground_truth import ATTACHMENT, read_truth
 from pipeline.io.readers import Source, open_source
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.recording import write_recording
-from pipeline.io.recording.mcap_writer import repair
+from pipeline.io.recording.mcap_writer import repair, write_recording
 from pipeline.types.records import Imu, Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 

@@ -19,7 +19,7 @@ from ruamel.yaml import YAML
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.simulated import open_simulated
-from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.io.recording.messages import Message
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor, Truth, TruthPath, TruthTrees
 

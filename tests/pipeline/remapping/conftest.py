@@ -7,7 +7,8 @@ from contextlib import closing
 
 import pytest
 
-from pipeline.remapping import ClusterTable, KnownMap, ScanCache, ScanCaches
+from pipeline.remapping.preview import ClusterTable, KnownMap
+from pipeline.remapping.rerun import ScanCache, ScanCaches
 from tests.pipeline.remapping.mapped import BASE, mapper, run
 
 

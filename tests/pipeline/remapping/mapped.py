@@ -8,7 +8,7 @@ from pipeline.config import Parameters, preset
 from pipeline.io.readers import open_source
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.remapping import Rerun, ScanCache
+from pipeline.remapping.rerun import Rerun, ScanCache
 from pipeline.types.records import Frame, Step
 
 URI = "sim:paper?duration=6&odometry=poor"

@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 
 import pipeline.remapping.preview as preview_of
-from pipeline.remapping import ClusterTable, Rerun, ScanCaches, preview_trees, sample_scans
-from pipeline.remapping.preview import MOST_PLACES, SAMPLE_BYTES, SAMPLE_SCANS, _grouped
+from pipeline.remapping.preview import (
+    MOST_PLACES,
+    SAMPLE_BYTES,
+    SAMPLE_SCANS,
+    ClusterTable,
+    _grouped,
+    preview_trees,
+    sample_scans,
+)
+from pipeline.remapping.rerun import Rerun, ScanCaches
 from pipeline.types.records import Verdict
 from tests.pipeline.remapping.mapped import BASE, frames, mapper, run
 

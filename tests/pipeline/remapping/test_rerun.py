@@ -16,8 +16,13 @@ from pipeline.config.model import Value
 from pipeline.errors import StemmapError
 from pipeline.front_end import SegmentedScan
 from pipeline.io.checkpoints import encode
-from pipeline.remapping import Rerun, ScanCaches, segmentation_key
-from pipeline.remapping.rerun import SEGMENTATION_CLASSIFICATION, SEGMENTATION_STAGES
+from pipeline.remapping.rerun import (
+    SEGMENTATION_CLASSIFICATION,
+    SEGMENTATION_STAGES,
+    Rerun,
+    ScanCaches,
+    segmentation_key,
+)
 from pipeline.types.records import Frame, Step
 from tests.pipeline.remapping.mapped import BASE, frames, mapper, run
 

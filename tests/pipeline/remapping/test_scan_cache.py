@@ -14,8 +14,7 @@ import zstandard
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import encode
-from pipeline.remapping import Rerun, ScanCache, ScanCaches
-from pipeline.remapping.rerun import HIGHEST, unpack
+from pipeline.remapping.rerun import HIGHEST, Rerun, ScanCache, ScanCaches, unpack
 from pipeline.types.records import PoseMeasurement, Scan, Step, Turn
 from tests.pipeline.remapping.mapped import BASE, fill, frames, mapper, run
 
