@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 _REMEDY = "Copy the file again, or export it again"
 _AXES = ("x", "y", "z")
-_INVALID = "points without coordinates, or withheld by the file"
 
 
 def open_cloud(uri: str) -> PointCloud:
@@ -144,7 +143,7 @@ class PointCloud:
                 good = is_place(xyz)
                 read += len(xyz)
                 if not good.all():
-                    count_loss(self.losses, _INVALID, int(np.count_nonzero(~good)))
+                    count_loss(self.losses, self._table.invalid, int(np.count_nonzero(~good)))
                 yield xyz[good].astype(np.float32)
         except (OSError, ScanFileError) as error:
             what = f"cannot read: {error.strerror or error}" if isinstance(error, OSError) else str(error)
@@ -215,6 +214,7 @@ def _open_las(path: Path) -> PointTable:
         low=low,
         high=high,
         cut_above=system == SYSTEM_OF_DRIVE,
+        invalid="points that have no coordinates, or that the file withholds",
     )
 
 

@@ -78,6 +78,7 @@ class PointTable:
         crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
         low, high: Corners by the header, shape (3,) [m]; not checked. None if unknown.
         cut_above: Whether the field of view of a sensor cuts the trees, as in the cloud of a drive.
+        invalid: What is counted for a point whose coordinates are not finite or too large.
     """
 
     kind: str
@@ -89,6 +90,7 @@ class PointTable:
     low: Float | None = None
     high: Float | None = None
     cut_above: bool = False
+    invalid: str = "points without coordinates"
 
     def parts(self) -> Iterator[Columns]:
         """Yield all points in parts, see `read`. Of a file that is cut or damaged, or cannot be read on, the

@@ -8,6 +8,7 @@ import struct
 from contextlib import suppress
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
@@ -168,6 +169,16 @@ def test_an_uncompressed_file_that_is_cut_gives_what_is_there(tmp_path, points):
     cloud = open_cloud(str(file))
     assert sum(len(part) for part in cloud.parts()) == 10_000
     assert cloud.losses == {"points that the files promise but do not hold": 10_000}
+
+
+def test_points_that_the_file_withholds_are_left_out_and_counted(tmp_path, points):
+    file = write_las(tmp_path / "plot.las", points[:1000])
+    las = laspy.read(file)
+    las.withheld = np.arange(1000) % 10 == 0
+    las.write(file)
+    cloud = open_cloud(str(file))
+    assert sum(map(len, cloud.parts())) == 900
+    assert cloud.losses == {"points that have no coordinates, or that the file withholds": 100}
 
 
 def test_a_file_that_is_not_there_or_is_something_else(tmp_path, capsys):
