@@ -339,7 +339,8 @@ def localise(
     raise StemmapError(
         f"the robot was not found in the saved map: {match.reason if match else 'the source has no scan'}",
         where=source.description.uri,
-        remedy="Give the start with --start X,Y,YAW (m, m, degrees) or --start last",
+        remedy="Continue a map of the same stand, or give the start with --start X,Y,YAW (m, m, degrees) or "
+        "--start last",
     )
 
 

@@ -6,9 +6,9 @@ import argparse
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ SOURCE_HELP = (
 
 
 MOUNT = "X,Y,Z,ROLL,PITCH,YAW"
+COMPILATION_S = 10.0  # interval of the messages on compilation
 
 
 def program() -> str:
@@ -445,14 +446,23 @@ def progress_bar(total: int | None, unit: str, title: str = "") -> Any:  # noqa:
 
 @contextmanager
 def compilation_notice() -> Iterator[None]:
-    """Report the first kernel that must be compiled inside the context on stderr, above a progress bar."""
+    """Report on stderr, above a progress bar, that kernels are compiled inside the context: once at the first
+    kernel, and then the share of the compiled kernels at intervals of COMPILATION_S."""
     from tqdm import tqdm
 
+    from app.worker.numba_warmup import compiled_share
     from pipeline.jit import on_compiling
 
-    @cache
+    reported_at: list[float] = []
+
     def report() -> None:
-        tqdm.write(COMPILING, file=sys.stderr)
+        now, text = time.monotonic(), COMPILING
+        if reported_at:
+            if now < reported_at[-1] + COMPILATION_S or (share := compiled_share()) == 1.0:
+                return  # the last kernels are those of one kind of source, which the share does not count
+            text = f"{100.0 * share:.0f} % of the kernels are compiled"
+        reported_at.append(now)
+        tqdm.write(text, file=sys.stderr)
         sys.stderr.flush()
 
     with on_compiling(report):

@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers.base import Source, SourceDescription, count_loss
-from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses
+from pipeline.io.readers.pose_files import POSE_ROWS, TextError, pose_at, read_any_poses
 from pipeline.types.records import Odometry, Record, Scan, Truth
 
 
@@ -112,7 +112,7 @@ class FileOdometry:
             raise SourceError(
                 f"no poses can be read: {reason}",
                 where=str(path),
-                remedy="Rows are t x y z qx qy qz qw (TUM) or the 12 numbers of a 3 x 4 matrix (KITTI).",
+                remedy=f"Rows are {POSE_ROWS}.",
             ) from None
         self._T_lidar_base = T_base_lidar.inverse()
         self._row_of: dict[int, int] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -110,7 +111,7 @@ def _find_opener(path: Path, uri: str) -> Opener:
     if path.is_dir():
         opener = folder_opener(path)
         if opener is None:
-            inside = named(recordings_in(path))
+            inside = named(recordings_in(path) or _folders_of_runs(path))
             raise SourceError(
                 "the folder is no run" if inside else "nothing in the folder can be read",
                 where=uri,
@@ -245,6 +246,17 @@ def recordings_in(folder: Path) -> list[str]:
     """Return the sorted names of the files in a folder (not in folders in it) that are runs or clouds by
     their suffixes; OSError if it cannot be read."""
     return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
+
+
+def _folders_of_runs(folder: Path) -> list[str]:
+    """Return the sorted names, with a slash, of the folders in a folder that are runs or contain recordings;
+    without those that cannot be read. OSError if the folder itself cannot be read."""
+    found = []
+    for path in sorted(folder.iterdir()):
+        with suppress(OSError):
+            if path.is_dir() and (folder_opener(path) or recordings_in(path)):
+                found.append(f"{path.name}/")
+    return found
 
 
 def named(names: list[str]) -> str:

@@ -21,7 +21,8 @@ TEXT_LIMIT = 64 << 20
 #: Rotation from the axes of a camera (x right, y down, z forward) to those of a LiDAR.
 R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _STILL = 0.05
-TUM_COLUMNS = 8
+TUM_COLUMNS, KITTI_COLUMNS = 8, 12
+POSE_ROWS = "t x y z qx qy qz qw (TUM) or the 12 numbers of a 3 x 4 matrix (KITTI)"
 
 
 class TextError(Exception):
@@ -41,7 +42,7 @@ def read_poses(path: Path) -> list[Pose3]:
             COORDINATE_LIMIT or more.
         OSError: The file cannot be read.
     """
-    rows = read_table(path, 12).reshape(-1, 3, 4)
+    rows = read_table(path, KITTI_COLUMNS).reshape(-1, 3, 4)
     _check_positions(rows[:, :, 3])
     R, t = rows[:, :, :3], rows[:, :, 3]
     if not _are_rotations(R):
@@ -66,9 +67,10 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
         OSError: The file cannot be read.
     """
     lines = _lines(path)
-    if not lines or len(lines[0]) != TUM_COLUMNS:
-        return None, read_poses(path)
-    return read_tum_poses(path)
+    columns = len(lines[0]) if lines else 0
+    if columns not in (TUM_COLUMNS, KITTI_COLUMNS):
+        raise TextError(f"its rows have {columns} columns; readable are {POSE_ROWS}")
+    return read_tum_poses(path) if columns == TUM_COLUMNS else (None, read_poses(path))
 
 
 def read_tum_poses(path: Path) -> tuple[Int, list[Pose3]]:

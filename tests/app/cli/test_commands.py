@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from app.cli import COMMANDS, _check_command, main
+from app.cli import COMMANDS, _check_command, flags, main
+from app.common.text import COMPILING
 from pipeline.config import PRESETS, field_specs, from_toml, preset
+from pipeline.jit import on_compiling, others_compile
 
 RUN = "sim:paper?duration=2"
 
@@ -45,6 +47,17 @@ def test_an_option_that_is_mistyped_is_named(capsys):
     stemmap(capsys, "map", RUN, "--out", "x", "--presset", "forest").refused(
         2, "stemmap map does not know --presset", "Did you mean --preset?"
     )
+
+
+def test_compilation_is_reported_once_and_then_its_progress(capsys, monkeypatch):
+    monkeypatch.setattr("pipeline.jit.on_compiling", on_compiling)  # which tests/conftest.py replaces
+    now, share = [0.0], [0.25]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr("app.worker.numba_warmup.compiled_share", lambda: share[0])
+    with flags.compilation_notice():
+        for now[0], share[0] in ((0.0, 0.1), (9.0, 0.2), (10.0, 0.25), (15.0, 0.3), (20.0, 1.0)):
+            others_compile()
+    assert capsys.readouterr().err.splitlines() == [COMPILING, "25 % of the kernels are compiled"]
 
 
 def test_a_request_to_stop_that_came_while_kernels_were_loaded_is_one(capsys, monkeypatch):

@@ -100,7 +100,7 @@ def test_another_stand_is_not_found_in_the_map(stand, tmp_path, capsys):
     assert main(words) == 1
     told = capsys.readouterr().err
     assert "not found in the saved map" in told
-    assert "--start" in told
+    assert "Continue a map of the same stand, or give the start with --start" in told
     assert not (tmp_path / "out").exists()
 
 

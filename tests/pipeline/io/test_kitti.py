@@ -128,7 +128,7 @@ def test_the_number_of_a_file_is_its_row(tmp_path: Path, opened: Opened):
     ("text", "reason"),
     [
         (matrices(curve(7)), "it has 7 rows"),
-        ("1 2 3\n", "12 numbers"),
+        ("1 2 3\n", "3 columns; readable are t x y z qx qy qz qw (TUM) or the 12 numbers"),
         ("nan " * 12, "finite"),
         ("1 " * 12, "rotations"),
         ("1 0 0 0 0 -1 0 0 0 0 1 0\n" * 11, "rotations"),

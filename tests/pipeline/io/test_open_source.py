@@ -36,6 +36,15 @@ def test_a_folder_without_scans_is_told(tmp_path: Path):
         open_source(str(tmp_path))
 
 
+def test_a_folder_of_data_sets_names_the_folders_that_can_be_opened(tmp_path: Path):
+    for name in ("b_run", "a_run", "notes"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "a_run" / "run.mcap").touch()
+    (tmp_path / "b_run" / "000000.bin").touch()
+    with pytest.raises(SourceError, match=r"the folder is no run.*Open what is in it: a_run/, b_run/\."):
+        open_source(str(tmp_path))
+
+
 def test_an_unknown_file_is_told(tmp_path: Path):
     path = tmp_path / "notes.txt"
     path.write_text("hello")
