@@ -302,7 +302,7 @@ def _crosses(places: Float) -> Float:
     return (places[:, None, None, :] + arms).reshape(-1, 2, 2)
 
 
-SIDE = 0.1  # side of a cell, which is shown as one point [m]
+SIDE = 0.1  # initial side of a cell, which is shown as one point [m]
 MOST_POINTS = 200_000
 MOST_RECENT = 400_000  # points of the scans that are kept for the time windows
 RECENT_STEP_NS = 200_000_000  # between two of these scans [ns]
@@ -313,10 +313,11 @@ _HALF = 1 << 20  # largest cell coordinate of a key
 
 
 class Accumulated:
-    """Filtered points of all scans in the frame of the map, one per cell and at most MOST_POINTS, placed by
-    the pose of their scan."""
+    """Filtered points of all scans in the frame of the map, one per cell, placed by the pose of their scan.
+    The side of the cells doubles where there would be more than MOST_POINTS points."""
 
     def __init__(self) -> None:
+        self._side = SIDE
         self._recent: list[_PlacedScan] = []
         self._rows = GrowingColumns(np.zeros((0, 3), np.float32), np.zeros(0, np.int64))  # points, cells
         # Columns, not objects: each scan of a long drive adds a row. Scan, points before it, pose.
@@ -333,8 +334,8 @@ class Accumulated:
         first.
 
         Nothing is added to `points` if the robot moved less than STEP and turned less than TURN since the
-        last added scan. Only the first point of each cell is kept, and none beyond MOST_POINTS. The time
-        windows of `points_of` do not depend on the motion.
+        last added scan. Only the first point of each cell is kept. The time windows of `points_of` do not
+        depend on the motion.
 
         Returns:
             Whether `points` changed.
@@ -349,15 +350,27 @@ class Accumulated:
             turned = abs((moved[2] + np.pi) % (2.0 * np.pi) - np.pi)
             if np.hypot(*moved[:2]) < STEP and turned < TURN:
                 return went_back
-        keys, first = np.unique(_keys(placed), return_index=True)
+        keys, first = np.unique(_keys(placed, self._side), return_index=True)
         count = len(self._rows)
-        new = np.sort(first[~np.isin(keys, self._rows.column(1))])[: MOST_POINTS - count]
+        new = np.sort(first[~np.isin(keys, self._rows.column(1))])
         row = len(scans)
         if row and before[-1] == count:
             row -= 1  # it added no point, and only the last such scan is needed, for its pose
         self._scans.write(row, np.array([frame.index]), np.array([count]), pose[None])
-        self._rows.write(count, placed[new].astype(np.float32), _keys(placed[new]))
+        self._rows.write(count, placed[new].astype(np.float32), _keys(placed[new], self._side))
+        while len(self._rows) > MOST_POINTS:
+            self._double_side()
         return went_back or len(new) > 0
+
+    def _double_side(self) -> None:
+        """Double the side of the cells; of each larger cell the first point is kept."""
+        self._side *= 2.0
+        points = self._rows.column(0)
+        keys = _keys(points, self._side)
+        kept = np.sort(np.unique(keys, return_index=True)[1])
+        scans, before, poses = (self._scans.column(k) for k in range(3))
+        self._scans.write(0, scans, np.searchsorted(kept, before), poses)
+        self._rows.write(0, points[kept], keys[kept])
 
     def points_of(self, window: str) -> NDArray[np.float32]:
         """Return the points that the layer shows in the frame of the map, float32, shape (N, 3) [m], one per
@@ -372,7 +385,7 @@ class Accumulated:
             return self.points
         start = self._recent[-1].stamp_ns - round(1e9 * seconds)
         points = np.concatenate([each.points for each in self._recent if each.stamp_ns >= start])
-        first = np.unique(_keys(points), return_index=True)[1]
+        first = np.unique(_keys(points, SIDE), return_index=True)[1]
         return points[np.sort(first)]
 
     def _keep_recent(self, frame: Frame, placed: NDArray[np.float64]) -> None:
@@ -434,11 +447,11 @@ class MapCloud:
             block.show(on, part, colours.ramp(part[:, 2], LOW, HIGH))
 
 
-def _keys(points: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the key of the cell of each point, shape (N,), for points of shape (N, 3) [m]. Coordinates
-    beyond about 105 km share the outermost cells."""
+def _keys(points: NDArray[np.floating], side: float) -> NDArray[np.int64]:
+    """Return the key of the cell of each point, shape (N,), for points of shape (N, 3) and cells with this
+    side [m]. Coordinates beyond 2^20 sides (105 km for SIDE) share the outermost cells."""
     cell = (
-        np.clip(np.floor(np.asarray(points, np.float64) / SIDE), -_HALF, _HALF - 1).astype(np.int64) + _HALF
+        np.clip(np.floor(np.asarray(points, np.float64) / side), -_HALF, _HALF - 1).astype(np.int64) + _HALF
     )
     keys: NDArray[np.int64] = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
     return keys

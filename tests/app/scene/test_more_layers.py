@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from app.scene import Scene
 from app.scene.map import BLOCK, SIDE, STEP, Accumulated, errors
@@ -65,12 +66,26 @@ def test_a_long_drive_stores_40_bytes_for_a_scan_and_20_for_a_point():
     assert size <= 2 * (40 * scans + 20 * len(gathered.points))  # the capacity doubles
 
 
-def test_a_run_has_at_most_so_many_points(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("app.scene.map.MOST_POINTS", 50)
-    gathered = Accumulated()
-    gathered.take(make_frame(0))
-    gathered.take(make_frame(1, pose=Pose2(5.0, 0.0, 0.0)))
-    assert len(gathered.points) == 50
+def test_the_cells_grow_where_a_drive_has_more_points_than_the_scene_shows(monkeypatch: pytest.MonkeyPatch):
+    """All parts of the drive stay in the scene, and a step back leaves the points of the scans before it."""
+    run = frames([(5.0 * k, 0.0) for k in range(12)])
+    fine, coarse, expected, after = Accumulated(), Accumulated(), [], []
+    for frame in run:
+        fine.take(frame)
+        expected.append(fine.points)
+    monkeypatch.setattr("app.scene.map.MOST_POINTS", len(fine.points) // 4)
+    for frame in run:
+        coarse.take(frame)
+        after.append(len(coarse.points))
+        assert after[-1] <= len(fine.points) // 4
+    cells = np.unique(np.floor(coarse.points.astype(np.float64) / coarse._side), axis=0)
+    assert len(cells) >= 0.98 * len(coarse.points)  # float32 may round a point over a border
+    distance, _ = cKDTree(coarse.points).query(fine.points)
+    assert distance.max() <= np.sqrt(3.0) * coarse._side
+    coarse.take(run[9])
+    assert len(coarse.points) < after[-1]
+    distance, _ = cKDTree(coarse.points).query(expected[9])
+    assert distance.max() <= np.sqrt(3.0) * coarse._side
 
 
 def test_a_time_window_has_the_points_of_the_last_seconds_also_after_a_step_back():
