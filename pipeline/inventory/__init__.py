@@ -230,7 +230,8 @@ class Inventory:
         slices = cut(near.points)
         counts = {**counts, "thinned": len(near.points), "in slices": len(slices.xy)}
         tiles = []
-        for tile in find_columns(near.points):
+        highest = whole.points[:, 2:].max(axis=0, initial=-np.inf).astype(np.float64)
+        for tile in find_columns(near.points, ground, highest):
             tiles.append(tile)
             yield 0.45
         return PlotPoints(ground, near, slices, *strongest_first(tiles), voxels, counts)

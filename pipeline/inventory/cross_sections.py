@@ -18,6 +18,7 @@ from pipeline.classification.features import COUNT, features
 from pipeline.classification.voxel_map import SIDE, SLICE, SLICES, TILE, VoxelMap
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
+from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.jit import compiled
 from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Float32, Int
@@ -319,14 +320,17 @@ LOST = 5  # slices (1 m) without a circle after which a stem ends
 OFTEN = 50.0  # number of scans in which a column counts as present
 
 
-def find_columns(points: Float32) -> Iterator[tuple[Float, Float]]:
+def find_columns(points: Float32, ground: TerrainRaster, highest: Float) -> Iterator[tuple[Float, Float]]:
     """Yield the upright columns of voxels, and their features for the random forest, by square tiles.
 
     A whole cloud is treated as if a robot had seen it from everywhere: each position was visible up to the
-    height in which stems are traced, and no column was ever absent.
+    upper end of the cloud, and no column was ever absent. The upper end is a level plane or a height above
+    the ground, so that stems which a cut through the cloud ends are no poles.
 
     Args:
         points: Points x, y, z and height above the ground, shape (N, 4) [m]; may be empty.
+        ground: Height map.
+        highest: Maximum z and maximum height above the ground of all points of the cloud, shape (2,) [m].
 
     Yields:
         Axes: x, y at 1.3 m above the ground [m], shift in x and y per metre of height, strength, shape (K,
@@ -340,9 +344,13 @@ def find_columns(points: Float32) -> Iterator[tuple[Float, Float]]:
         axis, profiles = examine(mean, returns, tile * TILE, TILE)
         n = len(axis)
         row = np.zeros((n, COUNT))
-        met = (profiles[:, :, 0] > 0.0).astype(np.int32)
-        always = (np.full(n, SLICES * SLICE), np.full(n, OFTEN), np.zeros(n))
-        features(axis, profiles, *always, met, 1 - met, row)
+        end = np.minimum(highest[1], highest[0] - ground.at(axis[:, 0], axis[:, 1]))
+        visible = np.arange(SLICES) * SLICE < end[:, None]
+        met = profiles[:, :, 0] > 0.0
+        features(
+            axis, profiles, SLICE * visible.sum(axis=1), np.full(n, OFTEN), np.zeros(n),
+            met.astype(np.int32), (visible & ~met).astype(np.int32), row,
+        )  # fmt: skip
         yield axis, row
 
 

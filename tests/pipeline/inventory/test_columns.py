@@ -6,6 +6,7 @@ import numpy as np
 
 from pipeline.inventory.cross_sections import find_columns, strongest_first
 from pipeline.inventory.stem_model import STEM, is_repeated
+from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.types.records import Verdict
 from tests.pipeline.inventory.plots import stem
 
@@ -19,7 +20,11 @@ def test_a_column_is_found_in_a_cloud_of_more_than_a_million_voxels():
     x, y = (v.ravel() for v in np.meshgrid(side, side))
     grass = np.column_stack([x, y, np.full(len(x), 0.3), np.full(len(x), 0.3)])
     assert len(grass) > 1 << 20
-    axes, _ = strongest_first(list(find_columns(np.concatenate([column, grass]).astype(np.float32))))
+    raster = TerrainRaster(
+        np.zeros(2), 110.0, np.zeros((1, 1)), np.ones((1, 1), np.bool_), np.ones((1, 1), np.bool_)
+    )
+    points = np.concatenate([column, grass]).astype(np.float32)
+    axes, _ = strongest_first(list(find_columns(points, raster, np.array([6.0, 6.0]))))
     away = np.hypot(*(axes[:, :2] - (-5.0, -5.0)).T)
     assert away.min() < 0.2
 

@@ -47,6 +47,27 @@ def test_stems_are_found_in_a_cloud_without_ground_returns(slope):
     assert to_stem.max() < 0.03
 
 
+@pytest.mark.parametrize("height", [3.0, 4.0, 5.0])
+@pytest.mark.parametrize("level", [True, False], ids=["level cut", "cut above the ground"])
+def test_stems_in_a_cloud_that_is_cut_off_are_no_poles(level, height):
+    """Nothing was observed above the cut, which is a level plane or follows the ground."""
+    slope = 0.0 if level else 0.35
+    points = plot(np.random.default_rng(1), slope=slope)
+    lowest = hill(points[:, 0], points[:, 1], slope)
+    m = map_plot(Made(points[points[:, 2] < height + (0.0 if level else lowest)]), FOREST)
+    _, away = errors(m.trees.position, PLACES)
+    assert len(m.trees.number) == len(PLACES)
+    assert away.max() < 0.03
+
+
+def test_a_pole_beside_trees_is_no_tree():
+    rng = np.random.default_rng(2)
+    pole = stem(10.5, 10.5, 0.05, rng, height=3.0, taper=0.0)
+    m = map_plot(Made(np.concatenate([plot(rng), pole])), FOREST)
+    assert len(m.trees.number) == len(PLACES)
+    assert np.hypot(*(m.trees.position - 10.5).T).min() > 1.0
+
+
 def test_lean_and_taper_are_told():
     rng = np.random.default_rng(2)
     points = np.concatenate(
