@@ -30,6 +30,7 @@ from pipeline.inventory.cross_sections import (
     slice_heights,
     strongest_first,
     trace,
+    upper_end,
 )
 from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of, without_heights
 from pipeline.inventory.stem_model import Stems, classify_stems, describe_stems, diameters, is_repeated
@@ -230,8 +231,7 @@ class Inventory:
         slices = cut(near.points)
         counts = {**counts, "thinned": len(near.points), "in slices": len(slices.xy)}
         tiles = []
-        highest = whole.points[:, 2:].max(axis=0, initial=-np.inf).astype(np.float64)
-        for tile in find_columns(near.points, ground, highest):
+        for tile in find_columns(near.points, ground, upper_end(whole.points, ground)):
             tiles.append(tile)
             yield 0.45
         return PlotPoints(ground, near, slices, *strongest_first(tiles), voxels, counts)

@@ -317,20 +317,44 @@ HOLLOW = 0.25  # largest share of points inside of a circle
 NOISE = 0.03  # m; noise of mobile scanners
 ALIKE = 0.3  # largest change of centre and radius between neighbouring slices, as a share of the radius
 LOST = 5  # slices (1 m) without a circle after which a stem ends
+#: m; radius of a crown. In a stand, something within it is as high as the cloud is there.
+CROWN = 3.0
 OFTEN = 50.0  # number of scans in which a column counts as present
 
 
-def find_columns(points: Float32, ground: TerrainRaster, highest: Float) -> Iterator[tuple[Float, Float]]:
+def upper_end(points: Float32, ground: TerrainRaster) -> Float:
+    """Return the height above the ground up to which each cell of the raster of the ground was observed,
+    shape (columns, rows) [m]; -inf far from all points.
+
+    It is the height of the highest point within CROWN. Where a level plane cuts the cloud, this is the point
+    with the largest z, and where the cut follows the ground that with the largest height above the ground;
+    the lower one counts.
+
+    Args:
+        points: Points of all heights: x, y, z and height above the ground, shape (N, 4) [m].
+        ground: Height map.
+    """
+    from scipy.ndimage import maximum_filter
+
+    highest = np.full((*ground.height.shape, 2), -np.inf)
+    np.maximum.at(highest, tuple(ground.cell_of(points[:, :2]).T), points[:, 2:])
+    side = 2 * round(CROWN / ground.cell) + 1
+    z, height = np.moveaxis(maximum_filter(highest, size=(side, side, 1)), 2, 0)
+    end: Float = np.minimum(height, z - ground.height)
+    return end
+
+
+def find_columns(points: Float32, ground: TerrainRaster, end: Float) -> Iterator[tuple[Float, Float]]:
     """Yield the upright columns of voxels, and their features for the random forest, by square tiles.
 
     A whole cloud is treated as if a robot had seen it from everywhere: each position was visible up to the
-    upper end of the cloud, and no column was ever absent. The upper end is a level plane or a height above
-    the ground, so that stems which a cut through the cloud ends are no poles.
+    upper end of the cloud around it, and no column was ever absent. Above a cut through the cloud nothing was
+    observed, so that the stems which end there are no poles.
 
     Args:
         points: Points x, y, z and height above the ground, shape (N, 4) [m]; may be empty.
         ground: Height map.
-        highest: Maximum z and maximum height above the ground of all points of the cloud, shape (2,) [m].
+        end: Result of `upper_end`.
 
     Yields:
         Axes: x, y at 1.3 m above the ground [m], shift in x and y per metre of height, strength, shape (K,
@@ -344,8 +368,7 @@ def find_columns(points: Float32, ground: TerrainRaster, highest: Float) -> Iter
         axis, profiles = examine(mean, returns, tile * TILE, TILE)
         n = len(axis)
         row = np.zeros((n, COUNT))
-        end = np.minimum(highest[1], highest[0] - ground.at(axis[:, 0], axis[:, 1]))
-        visible = np.arange(SLICES) * SLICE < end[:, None]
+        visible = np.arange(SLICES) * SLICE < end[tuple(ground.cell_of(axis[:, :2]).T)][:, None]
         met = profiles[:, :, 0] > 0.0
         features(
             axis, profiles, SLICE * visible.sum(axis=1), np.full(n, OFTEN), np.zeros(n),

@@ -67,10 +67,15 @@ class TerrainRaster:
         from scipy.ndimage import convolve
 
         count = convolve(self.seen.astype(np.int64), np.ones((3, 3), np.int64), mode="constant")
-        cell = np.floor((places - self.low) / self.cell).astype(np.int64)
-        column, row = np.clip(cell, 0, np.array(self.seen.shape) - 1).T
-        found: Int = count[column, row]
+        found: Int = count[tuple(self.cell_of(places).T)]
         return found
+
+    def cell_of(self, places: Float | Float32) -> Int:
+        """Return the column and row of the cell at each position of shape (N, 2) [m], int64, shape (N, 2);
+        outside of the raster, those of its nearest cell."""
+        cell = np.floor((places - self.low) / self.cell).astype(np.int64)
+        nearest: Int = np.clip(cell, 0, np.array(self.height.shape) - 1)
+        return nearest
 
 
 class LowestReturns:

@@ -24,7 +24,7 @@ def test_a_column_is_found_in_a_cloud_of_more_than_a_million_voxels():
         np.zeros(2), 110.0, np.zeros((1, 1)), np.ones((1, 1), np.bool_), np.ones((1, 1), np.bool_)
     )
     points = np.concatenate([column, grass]).astype(np.float32)
-    axes, _ = strongest_first(list(find_columns(points, raster, np.array([6.0, 6.0]))))
+    axes, _ = strongest_first(list(find_columns(points, raster, np.full((1, 1), 6.0))))
     away = np.hypot(*(axes[:, :2] - (-5.0, -5.0)).T)
     assert away.min() < 0.2
 
