@@ -35,8 +35,16 @@ LINE_LIMIT = 16 << 20
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
+# First byte of a line with the error that ended a child; no JSON begins with it.
+_FAILURE = b"!"
+
+
 class ProtocolError(StemmapError):
     """A child process sent a line that is too long or is not the expected JSON."""
+
+
+class ChildError(StemmapError):
+    """The error for people with which the program of a child process ended."""
 
 
 def python_module(name: str, *arguments: str) -> tuple[str, ...]:
@@ -135,6 +143,7 @@ class ChildProcess:
             timeout_s: Longest wait [s]; None for no limit.
 
         Raises:
+            ChildError: The program of the child ended with this error.
             ProtocolError: The line is too long or is not of this type; the child is to be ended.
             TimeoutError: No line came in time; the child still runs.
         """
@@ -237,6 +246,7 @@ class BlockingChildProcess:
             timeout_s: After this time the child is killed [s]; None for no limit.
 
         Raises:
+            ChildError: The program of the child ended with this error.
             ProtocolError: The line is too long or is not of this type; the child is to be ended.
         """
         timer = None if timeout_s is None else threading.Timer(timeout_s, self._process.kill)
@@ -307,6 +317,13 @@ class ParentConnection:
         self._outgoing.write(_encoded(message))
         self._outgoing.flush()
 
+    def fail(self, error: StemmapError) -> int:
+        """Send the error that ends the program, unless the parent has ended; return 1, the exit code."""
+        with contextlib.suppress(BrokenPipeError):
+            self._outgoing.write(_FAILURE + _encoded((error.what, error.where, error.remedy)))
+            self._outgoing.flush()
+        return 1
+
     def _read(self) -> None:
         """Queue the lines of the parent until it closes the connection; then end this process with code 1.
         Runs in a thread."""
@@ -322,7 +339,8 @@ def run_child(
     memory_limit: int | None = None,
     low_priority: bool = False,
 ) -> NoReturn:
-    """Run the program of a child process, then end the process: with code 0; with 1 after an exception, whose
+    """Run the program of a child process, then end the process: with code 0; with 1 after a StemmapError or
+    lack of memory, which the parent's `receive` raises as a ChildError; with 1 after another exception, whose
     traceback is printed; after SystemExit with its code, or with 1 if that is a message, which is printed;
     with 1 at once when the parent closes the connection or ends. It never returns.
 
@@ -341,9 +359,13 @@ def run_child(
     if memory_limit is not None:
         _limit_memory(memory_limit)
     incoming, outgoing = private_streams()
-    code = 0
+    parent, code = ParentConnection(incoming, outgoing), 0
     try:
-        main(ParentConnection(incoming, outgoing))
+        main(parent)
+    except StemmapError as error:
+        code = parent.fail(error)
+    except MemoryError:
+        code = parent.fail(StemmapError("this needs more memory than this machine has"))
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
         if isinstance(error.code, str):
@@ -395,11 +417,15 @@ def _decoded(line: bytes, kind: type[T]) -> T | None:
     """Return the message in a line; None for a line without a newline at its end.
 
     Raises:
+        ChildError: The line has the error that ended the child.
         ProtocolError: The line is not JSON of this type.
     """
     if not line.endswith(b"\n"):  # the sender ended, possibly in the middle of a line
         return None
     try:
+        if line.startswith(_FAILURE):
+            what, where, remedy = msgspec.json.decode(line[1:], type=tuple[str, str, str])
+            raise ChildError(what, where=where, remedy=remedy)
         return msgspec.json.decode(line, type=kind)
     except msgspec.MsgspecError as error:
         raise ProtocolError(f"protocol error: {error}") from None

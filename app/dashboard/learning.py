@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from app.common.child_process import ChildProcess, python_module
+from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.common.timers import cancel
 from app.store.async_store import AsyncStore
 from app.store.forests import LEAST_OTHERS, LEAST_TREES, PACKAGE, Forests
@@ -134,23 +134,26 @@ class Learning:
             "classification": parameters.classification.model_dump(),
             "folder": str(folder),
         }
+        learned, why = None, "the process ended without an answer; nothing was changed"
         try:
-            reply = await self._ask(question)
-        except StemmapError:
-            reply = {}
+            learned = await self._ask(question)
+        except ProtocolError:
+            pass
+        except StemmapError as error:
+            why = str(error)
         self._task = None
-        if learned := reply.get("learned"):
+        if learned:
             self._become("done", "", learned)
         else:
-            broke = "the process ended without an answer; nothing was changed"
-            self._become("failed", str(reply.get("error") or broke))
+            self._become("failed", why)
 
-    async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Send a question to a new child process and return its last message; {} if it sends none. A message
-        with "progress" sets the state "working".
+    async def _ask(self, question: dict[str, Any]) -> dict[str, Any] | None:
+        """Send a question to a new child process and return "learned" of its last message; None if there is
+        none. A message with "progress" sets the state "working".
 
         Raises:
-            StemmapError: The process cannot be started, or sends something else.
+            StemmapError: The process cannot be started, or the training failed.
+            ProtocolError: The process sends something else.
         """
         last: dict[str, Any] = {}
         async with await ChildProcess.start(self._command, line_limit=LONGEST_LINE) as process:
@@ -159,4 +162,4 @@ class Learning:
                 last = message
                 if "progress" in message:
                     self._become("working", str(message["progress"])[:300])
-        return last
+        return last.get("learned")

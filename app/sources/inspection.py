@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import msgspec
 
-from app.common.child_process import ChildProcess, ProtocolError, python_module
+from app.common.child_process import ChildError, ChildProcess, ProtocolError, python_module
 from app.sources.opening import check_address, check_cloud
 from app.sources.request import SourceRequest
 from pipeline.errors import SourceError, StemmapError
@@ -33,13 +33,6 @@ _semaphores: WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Semaphore] = W
 
 class TookTooLongError(StemmapError):
     """The child process was ended because it took too long."""
-
-
-class InspectionResult(msgspec.Struct, frozen=True):
-    """Answer of the child process, or the error (what, where, remedy); None if there is no error."""
-
-    content: dict[str, Any] = {}
-    error: tuple[str, str, str] | None = None
 
 
 async def ask(
@@ -68,9 +61,11 @@ async def ask(
     async with free, await ChildProcess.start(command, line_limit=LARGEST_ANSWER) as child:
         try:
             await child.send(question)
-            answer = await child.receive(InspectionResult, patience_s)
+            answer: dict[str, Any] | None = await child.receive(dict, patience_s)
         except ProtocolError:
             answer = None
+        except ChildError as error:
+            raise SourceError(error.what, where=error.where, remedy=error.remedy) from None
         except TimeoutError:
             raise TookTooLongError("it takes too long to be read", where=path) from None
     if answer is None:
@@ -79,10 +74,7 @@ async def ask(
             where=path,
             remedy="The file is damaged, or this is a fault in stemmap; the terminal may show more",
         )
-    if answer.error is not None:
-        what, where, remedy = answer.error
-        raise SourceError(what, where=where, remedy=remedy)
-    return answer.content
+    return answer
 
 
 async def check_source(request: SourceRequest) -> None:

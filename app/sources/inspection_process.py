@@ -20,7 +20,7 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
-from app.sources.inspection import MEMORY_LIMIT, InspectionResult
+from app.sources.inspection import MEMORY_LIMIT
 from app.sources.opening import open_cloud, open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
 from pipeline.errors import SourceError, StemmapError
@@ -325,17 +325,10 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 def answer(parent: ParentConnection) -> None:
-    """Receive one question of the parent process and send an `InspectionResult`. A StemmapError or lack of
-    memory is sent as an error; other exceptions, as for an unknown question, are raised and end the process.
-    """
+    """Receive one question of the parent process and send its answer, a dict. Exceptions, also that of an
+    unknown question, are raised and end the process."""
     question = parent.receive(dict)
-    try:
-        reply = InspectionResult(QUESTIONS[question["ask"]](question))
-    except StemmapError as error:
-        reply = InspectionResult(error=(error.what, error.where, error.remedy))
-    except MemoryError:
-        reply = InspectionResult(error=("it does not fit into the memory of this machine", "", ""))
-    parent.send(reply)
+    parent.send(QUESTIONS[question["ask"]](question))
 
 
 def _scores(evaluation: object) -> dict[str, Any] | None:

@@ -431,15 +431,9 @@ def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
 
 def serve(parent: ParentConnection) -> None:
     """Run the program of the child process: receive one `LearningRequest`, send {"progress": text} messages
-    and then {"learned": result of `train`} or, after StemmapError or MemoryError, {"error": text}. Other
-    exceptions are raised."""
-    try:
-        request = parent.receive(LearningRequest)
-        parent.send({"learned": train(request, lambda text: parent.send({"progress": text}))})
-    except StemmapError as error:
-        parent.send({"error": str(error)})
-    except MemoryError:
-        parent.send({"error": "this needs more memory than this machine has"})
+    and then {"learned": result of `train`}."""
+    request = parent.receive(LearningRequest)
+    parent.send({"learned": train(request, lambda text: parent.send({"progress": text}))})
 
 
 if __name__ == "__main__":

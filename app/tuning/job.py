@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from pydantic import BaseModel, ConfigDict, Field
 
-from app.common.child_process import ChildProcess, ProtocolError, python_module
+from app.common.child_process import ChildError, ChildProcess, ProtocolError, python_module
 from app.common.text import count
 from app.common.timers import cancel
 from app.robot.address import is_live
@@ -147,13 +147,14 @@ class TuneSearch:
 
     async def _listen(self, process: ChildProcess) -> None:
         """Process the messages of the child process until it ends, and send the state after each. The state
-        becomes "failed" after a protocol error, or if the process ends without a result."""
+        becomes "failed" after an error of the search or a protocol error, or if the process ends without a
+        result."""
         try:
             while (message := await process.receive(SearchMessage)) is not None:
                 self._take(message)
                 self.show()
-        except ProtocolError as error:
-            self._fail(error.what)
+        except (ChildError, ProtocolError) as error:
+            self._fail(str(error))
         finally:
             await process.end(_GRACE_S)
         if self._state not in ("done", "failed"):
@@ -169,9 +170,6 @@ class TuneSearch:
                 self._state = "searching"
         if message.result is not None:
             self.result, self._state = message.result, "done"
-        elif message.error is not None:
-            what, where, remedy = message.error
-            self._fail(str(StemmapError(what, where=where, remedy=remedy)))
         elif message == SearchMessage() and self._state == "stopping" and self._start is None:
             self._forget()  # there is no result
             self._state = "done"

@@ -53,13 +53,11 @@ class SearchMessage(msgspec.Struct, frozen=True, omit_defaults=True):
         start: Scores of the parameters with which the search begins.
         trials: Trials since the last message.
         result: The result; the last message.
-        error: What happened, where, and what to do; the last message.
     """
 
     start: Trial | None = None
     trials: tuple[Trial, ...] = ()
     result: Result | None = None
-    error: tuple[str, str, str] | None = None
 
 
 def result_of(search: Search) -> Result:

@@ -306,16 +306,10 @@ _MESSAGE_INTERVAL_S = 0.25
 
 def search_for_page(parent: ParentConnection) -> None:
     """Run the program of the child process of a search: receive a `Plan`, search until a further message
-    arrives, all trials are made or the time is over, and send `SearchMessage`s. StemmapError and MemoryError
-    are sent as the last message, not raised."""
+    arrives, all trials are made or the time is over, and send `SearchMessage`s."""
     plan = parent.receive(Plan)
-    try:
-        with closing(search_processes(plan)) as processes:
-            _search_for_page(Search(plan, processes), parent)
-    except StemmapError as error:
-        parent.send(SearchMessage(error=(error.what, error.where, error.remedy)))
-    except MemoryError:
-        parent.send(SearchMessage(error=("the search needs more memory than this machine has", "", "")))
+    with closing(search_processes(plan)) as processes:
+        _search_for_page(Search(plan, processes), parent)
 
 
 def _search_for_page(search: Search, parent: ParentConnection) -> None:

@@ -7,6 +7,7 @@ import signal
 import time
 
 from app.common.child_process import ParentConnection, run_child
+from pipeline.errors import SourceError
 
 
 def serve(parent: ParentConnection) -> None:
@@ -25,10 +26,9 @@ def serve(parent: ParentConnection) -> None:
         elif message == "pid":
             parent.send(os.getpid())
         elif message == "allocate":
-            try:
-                parent.send(len(bytearray(1 << 30)))
-            except MemoryError:
-                parent.send("MemoryError")
+            parent.send(len(bytearray(1 << 30)))
+        elif message == "refuse":
+            raise SourceError("it is empty", where="a.mcap", remedy="Take another")
         else:
             raise ValueError(message)
 

@@ -11,6 +11,7 @@ import pytest
 
 from app.common.child_process import (
     BlockingChildProcess,
+    ChildError,
     ChildProcess,
     ProtocolError,
     exit_reason,
@@ -76,8 +77,17 @@ def test_a_blocking_child_answers_and_is_killed_when_it_takes_too_long():
 def test_memory_beyond_the_limit_is_refused():
     child = BlockingChildProcess(PROGRAM)
     child.send("allocate")
-    assert child.receive(str) == "MemoryError"
-    child.end()
+    with pytest.raises(ChildError, match="more memory than this machine has"):
+        child.receive(str)
+    assert child.end(5.0) == 1
+
+
+def test_the_error_of_a_program_reaches_its_parent():
+    child = BlockingChildProcess(PROGRAM)
+    child.send("refuse")
+    with pytest.raises(ChildError, match=r"it is empty \(a\.mcap\)\. Take another"):
+        child.receive(str)
+    assert child.end(5.0) == 1
 
 
 def test_a_child_ends_when_its_parent_is_killed():

@@ -98,7 +98,7 @@ async def test_a_file_that_was_damaged_meanwhile_is_refused_and_the_old_trees_st
 @pytest.mark.parametrize(
     ("lines", "told"),
     [
-        ([{"error": "too little was annotated"}], "too little was annotated"),
+        (['!["too little was annotated","",""]'], "too little was annotated"),
         ([], "ended without an answer"),
         (["no JSON"], "ended without an answer"),
         (["long"], "ended without an answer"),

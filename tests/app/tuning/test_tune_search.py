@@ -90,7 +90,7 @@ async def test_what_a_search_says_is_told_and_its_set_is_a_file_with_its_provena
     ("command", "words"),
     [
         (
-            says(SearchMessage(error=("the run is empty", "run.mcap", "Take another"))),
+            says(then="""print('!["the run is empty","run.mcap","Take another"]')"""),
             "the run is empty (run.mcap). Take",
         ),
         (says(SAID[0]), "ended unexpectedly"),
