@@ -108,9 +108,9 @@ def main(arguments: list[str] | None = None) -> int:
     for k in range(len(words) - 1, 0, -1):
         if _NEGATIVE.match(words[k]) and words[k - 1].startswith("--") and words[k - 1] != "--":
             words[k - 1 : k + 1] = [f"{words[k - 1]}={words[k]}"]
-    parser, known = _build_parser(words[0])
     parsed = argparse.Namespace()
     try:
+        parser, known = _build_parser(words[0])
         _check_command(words)
         parsed, unknown = parser.parse_known_args(words)
         if unknown:

@@ -4,13 +4,9 @@ tree."""
 from __future__ import annotations
 
 import argparse
-import os
-import re
 import sys
-from datetime import date
 from pathlib import Path
 
-from app.cli import flags
 from pipeline.errors import StemmapError
 
 HELP = "measure speed and memory, and write docs/benchmarks.md (needs the source tree)"
@@ -19,100 +15,25 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments."""
-    parser.add_argument("names", metavar="NAME", nargs="*", help="benchmarks to run (default: all)")
-    parser.add_argument("--list", action="store_true", help="only list the benchmarks")
-    parser.add_argument(
-        "--seeds",
-        metavar="A-B",
-        type=_seeds,
-        help="seeds of benchmarks that map a recording several times, such as 1-20 (default: their own)",
-    )
-    parser.add_argument(
-        "--hours", metavar="N", type=flags.positive_number(1000.0, "hours"), help="duration of `campaign`"
-    )
-    parser.add_argument("--scans", metavar="N", type=flags.whole_number(1000, 10**8), help="length of `soak`")
-    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures as JSON")
-    parser.add_argument(
-        "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
-    )
-    parser.add_argument(
-        "--pictures",
-        metavar="DIR",
-        type=Path,
-        help="only draw path, ground truth and map of the named benchmarks into a folder",
-    )
-    parser.add_argument(
-        "--date",
-        metavar="YYYY-MM-DD",
-        type=_date,
-        help="date of the figures (default: today)",
-    )
-    parser.epilog = "Sections of benchmarks that are not run stay unchanged."
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Run the benchmarks and write docs/benchmarks.md or --out; with --list or --pictures only list them or
-    draw pictures. --seeds, --hours and --scans are passed on by environment variables.
-
-    Returns:
-        Exit code: 1 if a benchmark failed, else 0.
+    """Add the arguments, which the benchmarks declare (`tests/benchmarks/command.py`).
 
     Raises:
-        StemmapError: This is not the source tree, or a name is unknown.
+        StemmapError: This is not the source tree.
     """
-    _find_benchmarks(_ROOT)
-    from tests.benchmarks.runner import descriptions
-    from tests.benchmarks.runner import run as run_benchmarks
-    from tests.benchmarks.seeds import VARIABLE
-
-    if arguments.list:
-        known = descriptions()
-        for name, line in known.items():
-            print(f"{name:{max(map(len, known))}}  {line}")
-        return 0
-    if arguments.pictures is not None:
-        from tests.benchmarks.plots import draw_all
-
-        for file in draw_all(arguments.names, arguments.pictures):
-            print(f"{file}: {file.stat().st_size / 1000:.0f} kB", flush=True)
-        return 0
-    out = arguments.out or _ROOT / "docs" / "benchmarks.md"
-    day = arguments.date or date.today()
-    if arguments.seeds is not None:
-        os.environ[VARIABLE] = arguments.seeds
-    for name in ("hours", "scans"):
-        if (value := getattr(arguments, name)) is not None:
-            os.environ[f"STEMMAP_BENCH_{name.upper()}"] = str(value)
-    failed = run_benchmarks(arguments.names, out=out, json_file=arguments.json, day=day)
-    return 1 if failed else 0
-
-
-def _find_benchmarks(root: Path) -> None:
-    """Make the package `tests` of the source tree importable by adding the tree to `sys.path`.
-
-    Raises:
-        StemmapError: The folder is not the source tree.
-    """
-    if not (root / "tests" / "benchmarks" / "runner.py").is_file():
+    if not (_ROOT / "tests" / "benchmarks" / "command.py").is_file():
         raise StemmapError(
             "the benchmarks are not part of the installed package",
             remedy="Run `uv run stemmap bench` in a clone of the source tree",
         )
-    if str(root) not in sys.path:
-        sys.path.insert(0, str(root))
+    if str(_ROOT) not in sys.path:
+        sys.path.insert(0, str(_ROOT))
+    from tests.benchmarks import command
+
+    command.configure(parser)
 
 
-def _seeds(text: str) -> str:
-    """Return the text if it is a number or a range A-B; raises argparse.ArgumentTypeError otherwise."""
-    if not re.fullmatch(r"\d{1,9}(-\d{1,9})?", text):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a range of seeds like 1-20")
-    return text
+def run(arguments: argparse.Namespace) -> int:
+    """Run the benchmarks, see `tests.benchmarks.command.run`."""
+    from tests.benchmarks import command
 
-
-def _date(text: str) -> date:
-    """Parse a date YYYY-MM-DD; raises argparse.ArgumentTypeError for other texts."""
-    try:
-        return date.fromisoformat(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a date like 2026-01-31") from None
+    return command.run(arguments)
