@@ -1,13 +1,18 @@
-"""The course of a run: quantities of each mapped scan for charts, in bounded memory."""
+"""What is known of each mapped scan of a run: quantities for charts, in bounded memory, and totals."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from app.batch.summary import warning_texts
+from app.common.timers import TOTAL
+from app.worker.protocol import RunCounts
+from pipeline.geometry.columns import GrowingColumns
 from pipeline.types.records import Float, Frame, Int, Verdict
 
 
@@ -78,6 +83,20 @@ def read_quantities(frame: Frame) -> dict[str, float]:
     return {name: quantity.read(frame) for name, quantity in QUANTITIES.items() if quantity.read is not None}
 
 
+#: Beginning of the names of the times of stages [ms] in a ScanSeries.
+STAGE = "stage "
+
+
+def stage_times(times: Mapping[str, float]) -> dict[str, float]:
+    """Return a dict from names in a ScanSeries to the times of mapping a scan [ms]: "mapping", the total, and
+    each stage and the total with STAGE before its name.
+
+    Args:
+        times: Times by stage, with TOTAL.
+    """
+    return {"mapping": times[TOTAL], **{f"{STAGE}{name}": spent for name, spent in times.items()}}
+
+
 MOST_ROWS = 8192  # scans of ten minutes at 10 Hz, and a longer run in larger steps
 
 
@@ -95,9 +114,9 @@ class ScanSeries:
         self._stride = 1
 
     def record(self, index: int, values: Mapping[str, float]) -> None:
-        """Store the values of the scan with an index (0 or more), in place of earlier ones of this scan;
-        names that are missing in `values` become NaN. If the index is beyond the rows, `stride` doubles until
-        it fits. A scan whose index is no multiple of `stride` is ignored."""
+        """Store values of the scan with an index (0 or more), in place of earlier ones of this scan; its
+        values of other names stay. If the index is beyond the rows, every second row is removed until it
+        fits. A scan that belongs to no row is ignored."""
         while index // self._stride >= self._rows:
             self._stride *= 2
             for column in self._columns.values():
@@ -105,16 +124,10 @@ class ScanSeries:
                 column[self._rows // 2 :] = np.nan
         if index % self._stride:
             return
-        for name in values:
+        for name, value in values.items():
             if name not in self._columns:
                 self._columns[name] = np.full(self._rows, np.nan)
-        for name, column in self._columns.items():
-            column[index // self._stride] = values.get(name, math.nan)
-
-    @property
-    def stride(self) -> int:
-        """Difference between the indices of successive kept scans, a power of two."""
-        return self._stride
+            self._columns[name][index // self._stride] = value
 
     def forget_from(self, index: int) -> None:
         """Remove the values of the scan with this index and of later ones."""
@@ -141,3 +154,56 @@ class ScanSeries:
             kept = np.flatnonzero((scans % self._stride == 0) & (scans < self._rows * self._stride))
             found[kept] = column[scans[kept] // self._stride]
         return found
+
+
+_STATES = ("good", "weak", "lost")
+_MOST_WARNINGS = 200  # texts, which are sent with each scan
+
+
+class ScanCounts:
+    """Totals of verdicts, pose quality and warnings up to each scan of a map, also after the run went
+    back."""
+
+    def __init__(self) -> None:
+        # Numbers of clusters by verdict and of scans by state, and the largest known sigma [m].
+        self._rows = GrowingColumns(np.zeros((0, len(Verdict) + len(_STATES)), np.int32), np.zeros(0))
+        self._warned: list[Counter[str]] = []
+
+    def record(self, frame: Frame) -> None:
+        """Add the scan after the last one; any other scan is ignored, also one that is mapped again."""
+        known, sigma = len(self._warned), frame.health.sigma_xy
+        if frame.index != known:
+            return
+        totals, largest = (self._rows.column(k)[-1:] for k in range(2))
+        verdicts = np.bincount(frame.clusters.verdict, minlength=len(Verdict))
+        counted = np.append(verdicts, [frame.health.state == name for name in _STATES])
+        self._rows.write(
+            known,
+            totals.sum(axis=0, keepdims=True) + counted,
+            np.array([np.fmax.reduce([*largest, sigma if math.isfinite(sigma) else math.nan])]),
+        )
+        warned = self._warned[-1] if known else Counter[str]()
+        self._warned.append(warned + Counter(frame.warnings) if frame.warnings else warned)
+
+    def forget_from(self, index: int) -> None:
+        """Remove the scan with this index and later ones."""
+        del self._warned[index:]
+        self._rows.return_to(len(self._warned))
+
+    def totals(self, index: int, warnings: Sequence[str], losses: Mapping[str, int]) -> RunCounts:
+        """Return the totals up to a scan that was recorded. `health` has all states; `verdicts` and `losses`
+        have only entries above 0; `covered` is None. At most 200 different warnings are returned.
+
+        Args:
+            index: Index of the scan.
+            warnings: Warnings about the source, which come first.
+            losses: Dict from reasons to numbers of left-out messages.
+        """
+        totals, sigma = self._rows.column(0)[index].tolist(), float(self._rows.column(1)[index])
+        return RunCounts(
+            dict(zip(_STATES, totals[len(Verdict) :], strict=True)),
+            round(sigma, 4) if math.isfinite(sigma) else None,
+            dict(sorted((verdict.label, n) for verdict, n in zip(Verdict, totals, strict=False) if n)),
+            {reason: n for reason, n in losses.items() if n},
+            warning_texts(Counter(warnings) + self._warned[index])[:_MOST_WARNINGS],
+        )

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
@@ -15,14 +15,12 @@ from typing import Generic, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from app.batch.summary import warning_texts
 from app.explain.history import TreeHistory
-from app.worker.course import ScanSeries, read_quantities
+from app.worker.course import ScanCounts, ScanSeries, read_quantities
 from app.worker.protocol import (
     LENGTH_BYTES,
     MapChanges,
     MessageCodec,
-    RunCounts,
     Shown,
     TreeChange,
     WireError,
@@ -31,7 +29,7 @@ from app.worker.tree_numbers import SAME
 from pipeline.config import Parameters
 from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
-from pipeline.geometry.columns import GrowingColumns, columns_of, rows_in_common, rows_of
+from pipeline.geometry.columns import columns_of, rows_in_common, rows_of
 from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
 from pipeline.remapping.preview import ClusterTable
@@ -171,68 +169,6 @@ class FrameStore:
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
 NS = 1_000_000_000
-_STATES = ("good", "weak", "lost")
-_MOST_WARNINGS = 200  # texts, which are sent with each scan
-
-
-class ScanCounts:
-    """Verdicts, pose quality and warnings of the scans of a map, so that their totals up to each scan are
-    known, also after the run went back. The totals of the next scan add to those of the scan before."""
-
-    def __init__(self) -> None:
-        self._rows = GrowingColumns(
-            np.zeros((0, len(Verdict)), np.int32), np.zeros((0, len(_STATES)), np.bool_), np.zeros(0)
-        )
-        self._warnings: dict[int, tuple[str, ...]] = {}  # of the scans with warnings
-        self._begin()
-
-    def _begin(self) -> None:
-        """Set the totals to those of no scan."""
-        self._summed = 0  # scans
-        self._verdicts, self._states = np.zeros(len(Verdict), np.int64), np.zeros(len(_STATES), np.int64)
-        self._sigma, self._warned = -math.inf, Counter[str]()
-
-    def record(self, frame: Frame) -> None:
-        """Store the counts of a scan, in place of earlier ones. A scan beyond the next one is ignored."""
-        index, known = frame.index, len(self._rows)
-        if index > known:
-            return
-        if index < self._summed:
-            self._begin()
-        verdicts = np.bincount(frame.clusters.verdict, minlength=len(Verdict))
-        state = np.array([frame.health.state == name for name in _STATES])
-        self._rows.write(index, verdicts[None], state[None], np.array([frame.health.sigma_xy]))
-        self._rows.return_to(max(known, index + 1))
-        self._warnings.pop(index, None)
-        if frame.warnings:
-            self._warnings[index] = tuple(frame.warnings)
-
-    def totals(self, index: int, warnings: Sequence[str], losses: Mapping[str, int]) -> RunCounts:
-        """Return the totals up to a scan that was recorded. `health` has all states; `verdicts` and `losses`
-        have only entries above 0; `covered` is None. At most 200 different warnings are returned.
-
-        Args:
-            index: Index of the scan.
-            warnings: Warnings about the source, which come first.
-            losses: Dict from reasons to numbers of left-out messages.
-        """
-        if index + 1 < self._summed:
-            self._begin()
-        verdicts, states, sigma = (self._rows.column(k)[self._summed : index + 1] for k in range(3))
-        self._verdicts += verdicts.sum(axis=0)
-        self._states += states.sum(axis=0)
-        self._sigma = float(np.max(sigma[np.isfinite(sigma)], initial=self._sigma))
-        for scan in range(self._summed, index + 1):
-            self._warned.update(self._warnings.get(scan, ()))
-        self._summed = index + 1
-        counted = zip(Verdict, self._verdicts.tolist(), strict=True)
-        return RunCounts(
-            dict(zip(_STATES, self._states.tolist(), strict=True)),
-            round(self._sigma, 4) if math.isfinite(self._sigma) else None,
-            dict(sorted((verdict.label, n) for verdict, n in counted if n)),
-            {reason: n for reason, n in losses.items() if n},
-            warning_texts(Counter(warnings) + self._warned)[:_MOST_WARNINGS],
-        )
 
 
 class RunMap:
@@ -279,7 +215,7 @@ class RunMap:
         self._view_selection, self._newest_ns = ViewSelection(), -1
         self._start_ns, self._time_s = start_ns, -math.inf
 
-    def add(self, frame: Frame, free: Float) -> None:
+    def add(self, frame: Frame, free: Float, times: Mapping[str, float]) -> None:
         """Add the results of the scan that was mapped last. If the run went back, the entries of this scan
         replace earlier ones, and `history` and `clusters` lose those of later scans; stored frames and views
         stay. A tree keeps the time of its first confirmation, unless the run went back to or before it.
@@ -287,13 +223,14 @@ class RunMap:
         Args:
             frame: The results.
             free: Free range of the scan by direction, shape (BINS,) [m].
+            times: Times of mapping the scan for `course`, see `stage_times`; empty if they are unknown.
         """
         start_ns = self._start_ns()
         self.history.record(frame, start_ns)
         self.clusters.record(frame)
         self.counts.record(frame)
         time_s = (frame.stamp_ns - start_ns) / NS
-        self.course.record(frame.index, {"time_s": time_s, **read_quantities(frame)})
+        self.course.record(frame.index, {"time_s": time_s, **read_quantities(frame), **times})
         if time_s <= self._time_s:
             self.confirmed_s = {number: at for number, at in self.confirmed_s.items() if at < time_s}
         self._time_s = time_s
@@ -326,6 +263,7 @@ class RunMap:
         if changes:
             self.snapshots.forget_after(index)
             self.course.forget_from(index)
+            self.counts.forget_from(index)
             if self.frames is not None:
                 self.frames.forget_from(index)
         return changes
@@ -376,7 +314,7 @@ class Remapping:
         if rerun.done < until:
             if snapshots.is_due(rerun.done):
                 snapshots.offer(rerun.done, rerun.mapper.snapshot())
-            self.map.add(rerun.map_next(), rerun.free)
+            self.map.add(rerun.map_next(), rerun.free, {})
         return rerun.done == until
 
     def finish(self) -> RunMap:

@@ -18,7 +18,7 @@ from app.common.timers import TOTAL, Stopwatch
 from app.explain.records import History
 from app.robot.source import LiveSource
 from app.sources.request import with_odometry
-from app.worker.course import QUANTITIES, ScanSeries
+from app.worker.course import QUANTITIES, STAGE, stage_times
 from app.worker.cursor import Cursor, StepStore, live_steps
 from app.worker.protocol import RunCounts, RunCourse, Shown
 from app.worker.remap import (
@@ -104,7 +104,6 @@ class Run:
         self._cache = caches.of(parameters)
         self._numbers = TreeNumbers()
         self._views_sent = 0
-        self._times = ScanSeries()  # of mapping each scan, by stage [ms]
         self._odometry_xy = GrowingColumns(np.zeros((0, 2)))  # x, y of each scan
         self._remapping: Remapping | None = None
         self._previous: RunMap | None = None  # the map before the last change of parameters, for undo
@@ -134,23 +133,19 @@ class Run:
     def course(self, names: Sequence[str], most: int, *, stages: bool) -> RunCourse:
         """Return the course of the map, see `AskCourse` for the arguments; quantities without a value in any
         scan, and names that are not in QUANTITIES, are NaN."""
-        series, times, path = self._map.course, self._times, self.path
+        series, path = self._map.course, self.path
         scans = series.scans("time_s")
-        # Of a long run, each table keeps every 2nd, 4th, ... scan: these are in both.
-        scans = scans[scans % max(series.stride, times.stride) == 0]
         scans = np.append(scans[:-1][evenly_spaced(len(scans) - 1, most - 1)], scans[-1:])
         values = {name: series.values(name, scans) for name in names}
-        total = times.values(TOTAL, scans)
-        if "mapping" in values:
-            values["mapping"] = total
         if "driven" in values:
             driven = np.append(0.0, np.cumsum(np.hypot(np.diff(path.x), np.diff(path.y))))
             values["driven"] = np.append(driven[: len(path.x)], np.nan)[np.minimum(scans, len(path.x))]
-        of_stages = {name: times.values(name, scans) for name in times.names} if stages else {}
+        total = series.values("mapping", scans)
+        measured = [name for name in series.names if stages and name.startswith(STAGE)]
+        of_stages = {name.removeprefix(STAGE): series.values(name, scans) for name in measured}
         for spent in of_stages.values():
             spent[np.isnan(spent) & np.isfinite(total)] = 0.0
-        elsewhere = {"driven", *(["mapping"] if TOTAL in times.names else [])}
-        known = [name for name in QUANTITIES if name in elsewhere or name in series.names]
+        known = [name for name in QUANTITIES if name == "driven" or name in series.names]
         return RunCourse(scans, series.values("time_s", scans), values, of_stages, known)
 
     @property
@@ -256,8 +251,7 @@ class Run:
         self._broken = True
         with self.stopwatch.whole_scan() as times:
             frame, free = self._process(mapper, step, hurried=hurried)
-        if TOTAL in times and not self.is_bare:
-            self._times.record(step.index, times)
+        spent = {} if self.is_bare or TOTAL not in times else stage_times(times)
         if step.index == len(self._odometry_xy):
             place = frame.T_odom_base.x, frame.T_odom_base.y
             self._odometry_xy.write(step.index, np.array([place]))
@@ -266,7 +260,7 @@ class Run:
             self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))
         self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
         self._step, self.current = step, step.index
-        self._map.add(frame, free)
+        self._map.add(frame, free, spent)
         self.confirmed_s = self._map.confirmed(frame.trees)
         return self.frame
 
@@ -416,7 +410,6 @@ class Run:
             return None
         self._previous = self._map
         self._remapping, self._map, self._views_sent = None, remapping.finish(), 0
-        self._times = ScanSeries()  # those were of other parameters
         self._cache = self._caches.of(self._map.parameters.at(self.current))
         frame = self._map_step(self._step, new_map=True)
         confirmed_s = {self._numbers.known(n): at for n, at in self._map.confirmed_s.items()}

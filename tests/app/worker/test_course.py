@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.dashboard.payload import course_payload
-from app.worker.course import QUANTITIES, ScanSeries
+from app.worker.course import QUANTITIES, ScanSeries, stage_times
 from app.worker.run import Run
 from app.worker.session import Session
 from pipeline.config import Parameters
@@ -27,13 +27,13 @@ def test_kept_scans_are_evenly_spaced_and_have_their_values(scans: int, most: in
     np.testing.assert_array_equal(series.values("a", kept), 10.0 * kept)
 
 
-def test_a_scan_that_is_mapped_again_replaces_its_values_and_forgotten_ones_are_unknown() -> None:
+def test_a_scan_that_is_mapped_again_replaces_its_known_values_and_forgotten_ones_are_unknown() -> None:
     series = ScanSeries()
     for index in range(6):
         series.record(index, {"a": float(index), "b": 1.0})
     series.record(2, {"a": -1.0})
     np.testing.assert_array_equal(series.values("a", np.arange(4)), [0, 1, -1, 3])
-    np.testing.assert_array_equal(series.values("b", np.arange(4)), [1, 1, np.nan, 1])
+    np.testing.assert_array_equal(series.values("b", np.arange(4)), [1, 1, 1, 1])
     series.forget_from(3)
     assert series.scans("a").tolist() == [0, 1, 2]
     assert series.names == ["a", "b"]
@@ -105,18 +105,16 @@ def test_a_run_before_its_first_scan_has_an_empty_course() -> None:
     assert all(len(values) == 0 for values in found.values.values())
 
 
-def test_times_and_quantities_of_a_long_run_belong_to_the_same_scans() -> None:
-    """The map of a rerun keeps every scan while the times of the run keep every second one."""
+def test_a_stage_that_did_not_run_took_no_time() -> None:
     session = opened(40)
     session.play()
     for _ in range(30):
         session.work()
     run = session.run
     assert isinstance(run, Run)
-    run._times = ScanSeries(8)  # keeps every fourth scan of 30
     for index in range(30):
-        run._times.record(index, {"total": 2.0, **({"sometimes": 1.0} if index % 8 == 0 else {})})
+        times = {"total": 2.0, **({"sometimes": 1.0} if index % 2 == 0 else {})}
+        run._map.course.record(index, stage_times(times))
     found = run.course(["x", "mapping"], 100, stages=True)
-    assert found.scans.tolist() == [0, 4, 8, 12, 16, 20, 24, 28]
-    assert found.values["mapping"].tolist() == [2.0] * 8
-    assert found.stages["sometimes"].tolist() == [1.0, 0.0] * 4, "a stage that did not run took no time"
+    assert found.values["mapping"].tolist() == [2.0] * 30
+    assert found.stages["sometimes"].tolist() == [1.0, 0.0] * 15

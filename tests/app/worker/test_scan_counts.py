@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.worker.remap import ScanCounts
+from app.worker.course import ScanCounts
 from pipeline.types.records import Frame, Verdict
 from tests.app import fakes
 
@@ -29,25 +29,25 @@ def test_totals_are_those_of_the_scans_up_to_the_asked_one() -> None:
         assert found.warnings == ["no clock", "slow"][: 2 if index >= 2 else 1]
 
 
-def test_a_scan_that_is_mapped_again_replaces_its_counts() -> None:
+def test_scans_count_once_until_they_are_forgotten() -> None:
     counts = ScanCounts()
     for index in range(4):
         counts.record(scan(index, Verdict.TREE, warnings=("slow",)))
     assert counts.totals(3, [], {}).warnings == ["slow (4 times)"]
-    counts.record(scan(1, Verdict.BUSH, Verdict.BUSH))
-    assert counts.totals(1, [], {}).verdicts == {"bush": 2, "tree": 1}
-    assert counts.totals(3, [], {}).verdicts == {"bush": 2, "tree": 3}, (
-        "later scans stay until they are mapped"
-    )
-    assert counts.totals(3, [], {}).warnings == ["slow (3 times)"]
+    counts.record(scan(1, Verdict.BUSH))  # mapped again
     counts.record(scan(9, Verdict.WALL))  # beyond the next one
-    assert counts.totals(3, [], {}).verdicts == {"bush": 2, "tree": 3}
+    assert counts.totals(3, [], {}).verdicts == {"tree": 4}
+    counts.forget_from(1)
+    counts.record(scan(1, Verdict.BUSH, Verdict.BUSH))
+    assert counts.totals(0, [], {}).verdicts == {"tree": 1}
+    assert counts.totals(1, [], {}).verdicts == {"bush": 2, "tree": 1}
+    assert counts.totals(1, [], {}).warnings == ["slow"]
 
 
-def test_a_scan_takes_79_bytes() -> None:
+def test_a_scan_takes_88_bytes() -> None:
     counts, scans = ScanCounts(), 300
     for index in range(scans):
         counts.record(scan(index, Verdict.TREE))
-    each = 4 * len(Verdict) + 3 + 8  # numbers by verdict, pose quality, sigma
-    assert each == 79
+    each = 4 * (len(Verdict) + 3) + 8  # numbers by verdict and pose quality, sigma
+    assert each == 88
     assert sum(column.nbytes for column in counts._rows._columns) <= 2 * each * scans  # the capacity doubles
