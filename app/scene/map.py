@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
-from app.scene.labels import MOST_LABELS, Label, LabelNodes, Place
-from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
+from app.scene.nodes import (
+    MOST_LABELS,
+    Batch,
+    Circles,
+    CloudNode,
+    Float,
+    GroundNode,
+    Label,
+    LabelNodes,
+    Place,
+    Segments,
+)
 from pipeline.config.stages import Evaluation
 from pipeline.geometry.columns import GrowingColumns, rows_of
 from pipeline.types.records import HIDDEN, Frame, HeightMap, Trees, TruthTrees

@@ -1,4 +1,4 @@
-"""Building blocks of the scene: meshes, batches of meshes, point clouds, lines, and the ground.
+"""Building blocks of the scene: meshes, batches of meshes, point clouds, lines, labels, and the ground.
 
 Of each block only what changed is sent to the browsers. All coordinates are those of the map and part of the
 content of a node: viser's client draws a new pose of a node one picture before new content, so a scan whose
@@ -7,6 +7,9 @@ points move with a pose would be drawn away from the trees.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -288,6 +291,70 @@ class Circles(Segments):
                 height of the constructor above it.
         """
         self.show(on, circles(centres, radii, self._height + ground), np.repeat(each, SIDES, axis=0))
+
+
+MOST_LABELS = 60  # more than 200 halve the frame rate of a browser
+Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A text at a position in the frame of the map [m]; `key` identifies the labelled object."""
+
+    key: int
+    text: str
+    place: Place
+
+
+class LabelNodes:
+    """A pool of label nodes. A node keeps its object, so that an unchanged text is not sent again.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the parent node.
+        scale: Size of the text on the screen.
+    """
+
+    def __init__(self, scene: viser.SceneApi, name: str, scale: float = 0.9) -> None:
+        self._scene, self._name, self._scale = scene, name, scale
+        self._node_of: dict[int, viser.LabelHandle] = {}
+        self._shown: dict[int, Label] = {}
+        self._free: list[viser.LabelHandle] = []
+
+    def show(self, labels: Iterable[Label]) -> None:
+        """Show these labels, at most the first `MOST_LABELS`, and hide all others. Of labels with the same
+        key the last counts; a label that moves less than 15 cm keeps its position."""
+        wanted = {label.key: label for label in list(labels)[:MOST_LABELS]}
+        for key in self._shown.keys() - wanted.keys():
+            node = self._node_of.pop(key)
+            node.visible = False
+            self._free.append(node)
+            del self._shown[key]
+        for key, label in wanted.items():
+            if key not in self._shown:
+                self._node_of[key] = self._free.pop() if self._free else self._another()
+            self._place(key, label)
+
+    def _another(self) -> viser.LabelHandle:
+        """Add a hidden node to the pool and return it."""
+        return self._scene.add_label(
+            f"{self._name}/{len(self._node_of)}",
+            "",
+            font_screen_scale=self._scale,
+            anchor="bottom-center",
+            visible=False,
+        )
+
+    def _place(self, key: int, label: Label) -> None:
+        """Send a label to its node if its text changed or it moved by 15 cm or more."""
+        node, before = self._node_of[key], self._shown.get(key)
+        # Moves of a few centimetres make a label hard to read, and each one is a message.
+        if before is not None and math.dist(before.place, label.place) < 0.15:
+            label = replace(label, place=before.place)
+        if label == before:
+            return
+        self._shown[key] = label
+        node.text, node.position, node.visible = label.text, label.place, True
 
 
 CHUNK = 200  # segments per node, so that a long path is not sent again with each scan

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import Colours, ViewSettings
-from app.scene.labels import LabelNodes, Place, cluster_labels, shown_height
-from app.scene.nodes import Batch, CloudNode, Float
+from app.scene.nodes import MOST_LABELS, Batch, CloudNode, Float, Label, LabelNodes, Place
 from app.scene.robot import ROBOT
 from pipeline.evaluation import match
-from pipeline.types.records import Frame
+from pipeline.types.records import Frame, Verdict
 
 Vector = tuple[float, float, float]
 OnCluster = Callable[[int | None, Vector, Vector], None]
@@ -212,6 +211,76 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
     else:
         table = colours.by_verdict(clusters.verdict)
     return colours.of_points(table, frame.labels, colours.FILTERED)
+
+
+STEM_HEIGHT = 2.0  # [m], drawn where no height was measured
+OWN_TREE = 0.5  # m; a cluster this near to a labelled tree is that tree
+
+
+def cluster_labels(
+    frame: Frame, numbers: np.ndarray, label_by: str, taken: Sequence[Place] = ()
+) -> list[Label]:
+    """Return at most MOST_LABELS labels for the clusters of a scan, 0.1 m above their tops in the frame of
+    the map: first clusters with the verdict TREE, then others, each from near to far. Clusters without a text
+    (see `_cluster_text`) have no label; [] if `label_by` is "none".
+
+    Args:
+        frame: Results of the scan.
+        numbers: Persistent number of each cluster, shape (K,), the keys of the labels.
+        label_by: One of colours.LABEL_BY.
+        taken: Positions x, y, z of the labels of trees in the map [m]; a cluster at a horizontal distance of
+            less than OWN_TREE from one of them has no label.
+    """
+    if label_by == "none":
+        return []
+    clusters, pose = frame.clusters, frame.estimate.T_map_base
+    base = clusters.centroid + frame.sensor_offset
+    tops = frame.base_z + base[:, 2] + 0.5 * shown_height(clusters.extent[:, 2]) + 0.1
+    places = np.column_stack([pose.apply(base[:, :2]), tops])
+    order = np.lexsort((np.linalg.norm(base[:, :2], axis=1), clusters.verdict != Verdict.TREE))
+    texts = [_cluster_text(frame, k, label_by) for k in range(len(order))]
+    trees = np.array(taken).reshape(-1, 3)[:, :2]
+    named = [
+        k
+        for k in order.tolist()
+        if texts[k] and not (np.linalg.norm(trees - places[k, :2], axis=1) < OWN_TREE).any()
+    ]
+    return [Label(int(numbers[k]), texts[k], tuple(places[k].tolist())) for k in named[:MOST_LABELS]]
+
+
+def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
+    """Return the text of a cluster: the label of its verdict for "verdict"; the diameter in cm for "DBH", ""
+    if it is unknown; the eccentricity for "eccentricity", or the label of the verdict if that is NaN.
+
+    Args:
+        frame: Results of the scan.
+        k: Row of the cluster.
+        label_by: One of colours.LABEL_BY except "none".
+    """
+    verdict = Verdict(int(frame.clusters.verdict[k])).label
+    if label_by == "verdict":
+        return verdict
+    if label_by == "DBH":
+        radius = float(frame.clusters.radius[k])
+        return f"{200 * radius:.0f} cm" if np.isfinite(radius) else ""
+    eccentricity = float(frame.clusters.eccentricity[k])
+    return verdict if np.isnan(eccentricity) else f"λ1/λ2 {short(eccentricity)}"
+
+
+def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the height with which clusters are rendered, shape (K,) [m]: the height, at least 0.2, and
+    STEM_HEIGHT for NaN."""
+    return np.where(np.isnan(height), STEM_HEIGHT, np.maximum(height, 0.2))
+
+
+def short(value: float) -> str:
+    """Return a number as text: with one decimal below 10, as an integer below 100, and from 100 on with one
+    significant digit; "∞" if it is not finite."""
+    if not np.isfinite(value):
+        return "∞"
+    if value >= 100.0:
+        return f"{float(f'{value:.1g}'):.0f}"
+    return f"{value:.1f}" if value < 10.0 else f"{value:.0f}"
 
 
 MOST_VOXELS = 20_000  # drawn; boxes are slower than points

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.scene.labels import LabelNodes
+from app.scene.nodes import LabelNodes
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Clusters, Detections, Frame, PoseEstimate, Trees, Verdict
 

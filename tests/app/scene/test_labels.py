@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from app.scene import Scene
-from app.scene.labels import MOST_LABELS, Label, LabelNodes, cluster_labels, short
+from app.scene.nodes import MOST_LABELS, Label, LabelNodes
+from app.scene.scan import cluster_labels, short
 from tests.app.scene.frames import make_frame, make_trees, texts_of
 
 PATH = np.zeros((1, 2))

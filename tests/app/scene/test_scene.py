@@ -12,7 +12,7 @@ import pytest
 
 from app.scene import Scene
 from app.scene import scene as scene_module
-from app.scene.labels import MOST_LABELS
+from app.scene.nodes import MOST_LABELS
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import TruthTrees
 from tests.app.scene.frames import make_frame, make_trees, texts_of
