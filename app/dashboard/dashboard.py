@@ -111,7 +111,7 @@ class Dashboard:
         self.check_source = check_source
         self._opening = asyncio.Lock()
         self._go = False
-        self._show_scene = Throttle(lambda f, xy: self.scene.show(f, xy), pause_s=_SCENE_PAUSE_S)
+        self._show_scene = Throttle(lambda frame, path: self.scene.show(frame, path), pause_s=_SCENE_PAUSE_S)
 
     @property
     def start_ns(self) -> int:
@@ -497,7 +497,7 @@ class Dashboard:
             self._broadcast_events()
         self.run_recorder.shown(self._run_state(shown))
         self._score()
-        self._show_scene(shown.frame, self.path_xy)
+        self._show_scene(shown.frame, path_rows)
         await self.loop.shown(shown.time_s, self.status)
 
     def _run_state(self, shown: protocol.Shown) -> RunState:

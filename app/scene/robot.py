@@ -16,6 +16,7 @@ from pipeline.types.records import Frame, Zone
 ROBOT = "/world/robot"
 STEP = 0.05  # m
 MOST_POINTS = 10_000  # of a line; they are less than 1 m apart in the first hours of a drive
+FIRST_SCANS, FIRST_M = 10, 0.2  # the first direction is that of so many scans, if they are so far apart
 
 
 class RobotNodes:
@@ -30,17 +31,13 @@ class RobotNodes:
         self._particles = CloudNode(scene, "/world/particles", 0.06)
         self._path = LineNode(scene, "/world/path", colours.PATH, 0.05)
         self._odometry = LineNode(scene, "/world/odometry", colours.ODOMETRY, 0.03)
-        self._by_odometry: Float = np.zeros((MOST_POINTS, 3))  # scan, x, y
-        self._count, self._spacing = 0, 1
-        self._start = Pose2()
 
     def show(self, frame: Frame, path: Float, view: ViewSettings, ground: GroundNode) -> None:
-        """Show a pose. A scan that was shown before, or an earlier one, removes the odometry path from there
-        on, because the run went back.
+        """Show a pose and both paths.
 
         Args:
             frame: Results of the scan.
-            path: Positions at all scans so far in the frame of the map, shape (N, 2) [m].
+            path: Positions at all scans so far, see `Scene.show`.
             view: Visible layers.
             ground: Ground with its heights.
         """
@@ -52,28 +49,27 @@ class RobotNodes:
             np.column_stack([particles[:, :2], np.full(len(particles), frame.base_z + 0.05)]),
             colours.PARTICLES,
         )
-        self._follow_odometry(frame)
-        path = _thinned(path)
-        self._path.show(view.layers["path"], path, _stepped(ground, path))
-        places = self._by_odometry[: self._count, 1:]
-        self._odometry.show(view.layers["odometry"], places, _stepped(ground, places))
+        for line, layer, places in (
+            (self._path, "path", path[:, :2]),
+            (self._odometry, "odometry", aligned_odometry(path)),
+        ):
+            thin = _thinned(places)
+            line.show(view.layers[layer], thin, _stepped(ground, thin))
 
-    def _follow_odometry(self, frame: Frame) -> None:
-        """Add the pose by odometry only of a scan. Both paths begin at the pose of the first scan that is
-        shown. Of more than MOST_POINTS poses, every second one is dropped."""
-        self._count = int(np.searchsorted(self._by_odometry[: self._count, 0], frame.index))
-        if self._count == 0:  # both paths start at the same pose, so that the drift is visible
-            self._start, self._spacing = frame.estimate.T_map_base @ frame.T_odom_base.inverse(), 1
-        if self._count == MOST_POINTS:
-            self._spacing *= 2
-            self._count = MOST_POINTS // 2
-            self._by_odometry[: self._count] = self._by_odometry[::2]
-        scans = self._by_odometry[: self._count, 0]
-        if self._count >= 2 and scans[-1] - scans[-2] < self._spacing:
-            self._count -= 1  # the newest pose is always shown
-        at = self._start @ frame.T_odom_base
-        self._by_odometry[self._count] = frame.index, at.x, at.y
-        self._count += 1
+
+def aligned_odometry(path: Float) -> Float:
+    """Return the known positions by odometry, shape (M, 2) [m], moved to the start of the path and turned to
+    its first direction, so that the drift since then is visible; as on the 2D map.
+
+    Args:
+        path: As in `Scene.show`.
+    """
+    path = path[np.isfinite(path[:, 2])]
+    if not len(path):
+        return path[:, 2:]
+    x, y, ahead, left = path[min(FIRST_SCANS, len(path) - 1)] - path[0]
+    turn = np.arctan2(y, x) - np.arctan2(left, ahead) if np.hypot(ahead, left) > FIRST_M else 0.0
+    return path[0, :2] + Pose2(0.0, 0.0, float(turn)).apply(path[:, 2:] - path[0, 2:])
 
 
 def _thinned(path: Float) -> Float:

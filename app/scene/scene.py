@@ -51,7 +51,7 @@ class Scene:
         self._tuning = PanelCommands(commands, self._put_back)
         self._parameters, self._preset = preset("forest"), "forest"
         self._frame: Frame | None = None
-        self._path: Float = np.zeros((0, 2))
+        self._path: Float = np.zeros((0, 4))
         self._truth: TruthTrees | None = None
         self._selected: int | None = None
         self._ring: Ring = None
@@ -74,10 +74,11 @@ class Scene:
 
         Args:
             frame: Results of the scan.
-            path: Positions of the robot at all scans in the frame of the map, shape (N, 2) [m].
+            path: Positions of the robot at all scans: x, y in the frame of the map and x, y by odometry, NaN
+                where unknown, shape (N, 4) [m].
         """
         first = self._frame is None
-        self._frame, self._path = frame, np.asarray(path, dtype=np.float64).reshape(-1, 2)
+        self._frame, self._path = frame, path
         if first:
             self._follower.frame_plot(extent(frame) if frame.of_cloud else 0.0)
         self._accumulated.take(frame)
@@ -158,7 +159,7 @@ class Scene:
     def clear(self) -> None:
         """Remove run, ground truth and selection from the scene. The panel and the choices of the view
         stay; the cameras return to the size of a robot."""
-        self._frame, self._path = None, np.zeros((0, 2))
+        self._frame, self._path = None, np.zeros((0, 4))
         self._truth = self._selected = self._ring = None
         self._accumulated = Accumulated()
         self._follower.frame_plot(0.0)  # the new one does not know where the cameras are
@@ -254,7 +255,12 @@ class Scene:
             self._voxels.show(layers["voxels"], frame, parameters.filters.voxel_size)
             self._way.show_ahead(layers["way"], frame, parameters.obstacles)
             self._errors.show_errors(
-                layers["errors"], frame, self._truth, self._path, parameters.evaluation, self._map.ground
+                layers["errors"],
+                frame,
+                self._truth,
+                self._path[:, :2],
+                parameters.evaluation,
+                self._map.ground,
             )
 
     # --- callbacks in the thread of viser, passed to the loop -------------------------------------

@@ -22,7 +22,7 @@ class FakeScene(Scene):
         self.calls: list[tuple[str, Any]] = []
 
     def show(self, frame: Frame, path: Any) -> None:
-        assert path.shape[1] == 2
+        assert path.shape[1] == 4
         self.calls.append(("show", frame.index))
 
     def show_parameters(self, parameters: Parameters, preset_name: str) -> None:

@@ -12,7 +12,7 @@ from app.scene.nodes import MOST_CELLS, raster, surface, without_small_holes
 from pipeline.types.records import HeightMap
 from tests.app.scene.frames import make_frame
 
-PATH = np.column_stack([0.05 * np.arange(50), np.zeros(50)])
+PATH = np.column_stack([0.05 * np.arange(50), np.zeros(50)] * 2)
 
 
 def make_ground(side: int, slope: float = 0.2) -> HeightMap:

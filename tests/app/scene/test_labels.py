@@ -13,7 +13,7 @@ from app.scene.nodes import MOST_LABELS, Label, LabelNodes
 from app.scene.scan import cluster_labels, short
 from tests.app.scene.frames import make_frame, make_trees, texts_of
 
-PATH = np.zeros((1, 2))
+PATH = np.zeros((1, 4))
 
 
 def test_clusters_are_labelled_by_the_ratio_of_eigenvalues_and_trees_by_dbh(scene: Scene):

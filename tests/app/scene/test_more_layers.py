@@ -19,7 +19,7 @@ from pipeline.geometry.poses import Pose2
 from pipeline.types.records import HIDDEN, TruthTrees
 from tests.app.scene.frames import make_frame, make_trees
 
-PATH = np.column_stack([0.05 * np.arange(50), np.zeros(50)])
+PATH = np.column_stack([0.05 * np.arange(50), np.zeros(50)] * 2)
 
 
 def node(scene: Scene, name: str):
@@ -167,7 +167,7 @@ def test_errors_are_offsets_missed_and_false_trees():
     trees = make_trees(4)
     trees = replace(trees, position=np.array([[0.0, 0.1], [5.0, 5.0], [3.0, 0.0], [90.0, 0.0]]))
     truth = truth_of([0.0, 2.0, 3.05, 200.0], [0.0, 7.0, 0.0, 0.0], ("tree", "tree", "pole", "tree"))
-    offsets, missed, false = errors(trees, truth, PATH, Evaluation(match_distance=0.5, reach=20.0))
+    offsets, missed, false = errors(trees, truth, PATH[:, :2], Evaluation(match_distance=0.5, reach=20.0))
     np.testing.assert_allclose(offsets, [[[0.0, 0.0], [0.0, 0.1]]])
     np.testing.assert_allclose(missed, [[2.0, 7.0]])  # the farthest is out of reach
     np.testing.assert_allclose(false, [[5.0, 5.0], [3.0, 0.0]])  # a pole that was taken for a tree is one too
@@ -177,7 +177,7 @@ def test_a_tree_that_the_ground_truth_calls_hidden_is_no_error():
     trees = make_trees(2)
     trees = replace(trees, position=np.array([[0.0, 0.1], [4.0, 0.0]]))
     truth = truth_of([0.0, 2.0], [0.0, 0.0], (HIDDEN, HIDDEN))
-    offsets, missed, false = errors(trees, truth, PATH, Evaluation(match_distance=0.5, reach=20.0))
+    offsets, missed, false = errors(trees, truth, PATH[:, :2], Evaluation(match_distance=0.5, reach=20.0))
     assert (len(offsets), len(missed)) == (0, 0)
     np.testing.assert_allclose(false, [[4.0, 0.0]])
 

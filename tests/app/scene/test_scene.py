@@ -18,7 +18,7 @@ from pipeline.types.records import TruthTrees
 from tests.app.scene.frames import make_frame, make_trees, texts_of
 from tests.app.scene.recorder import buffered
 
-PATH = np.column_stack([0.05 * np.arange(1000), np.zeros(1000)])
+PATH = np.column_stack([0.05 * np.arange(1000), np.zeros(1000)] * 2)
 
 
 def node(scene: Scene, name: str):
@@ -238,15 +238,16 @@ def test_the_server_is_renewed_before_message_numbers_hurt(scene: Scene, monkeyp
     assert len(node(scene, "/world/trees").batched_positions) == 25
 
 
-def test_the_path_by_odometry_begins_with_the_path_and_follows_a_jump_back(scene: Scene):
+def test_the_path_by_odometry_begins_with_the_path_in_its_direction(scene: Scene):
     scene.choose("odometry", True)
-    for index in (0, 1, 2, 3, 1):
-        scene.show(make_frame(index), PATH[: index + 1])
-    last = make_frame(1)
-    segments = node(scene, "/world/odometry/0").points
-    assert len(segments) == 1
-    np.testing.assert_allclose(segments[0, 0, :2], [0.0, 0.0])
-    np.testing.assert_allclose(segments[0, 1, :2], [last.T_odom_base.x, last.T_odom_base.y], rtol=1e-6)
+    drifted = np.column_stack([PATH[:, :2], 7.0 - PATH[:, 1], 3.0 + 1.1 * PATH[:, 0]])  # along y
+    drifted[500:, 2:] = np.nan  # unknown
+    for rows in (40, 600):
+        scene.show(make_frame(rows), drifted[:rows])
+        places = drifted[: min(rows, 500), :2] * [1.1, 1.0]
+        chunks = range(len(places) // 200 + 1)
+        segments = np.concatenate([node(scene, f"/world/odometry/{k}").points for k in chunks])
+        np.testing.assert_allclose(segments[:, 1, :2], places[1:], atol=1e-5)
 
 
 def test_cameras_return_to_the_robot_after_a_large_cloud(scene: Scene, monkeypatch: pytest.MonkeyPatch):

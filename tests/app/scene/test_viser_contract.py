@@ -35,9 +35,9 @@ def test_viser_has_the_private_parts_that_are_used(scene: Scene):
 
 def test_a_browser_that_connects_later_gets_positions_and_colours_of_a_batch_by_one_message(scene: Scene):
     frame = make_frame(0)
-    scene.show(frame, np.zeros((1, 2)))
+    scene.show(frame, np.zeros((1, 4)))
     moved = dataclasses.replace(frame.trees, position=frame.trees.position + 0.1)
-    scene.show(dataclasses.replace(make_frame(1), trees=moved), np.zeros((2, 2)))
+    scene.show(dataclasses.replace(make_frame(1), trees=moved), np.zeros((2, 4)))
     kept = [
         message.updates
         for message in scene._server._websock_server.get_message_buffer().message_from_id.values()

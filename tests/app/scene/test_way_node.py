@@ -17,7 +17,7 @@ from pipeline.types.records import Clearance, Zone
 from tests.app.scene.frames import make_frame
 
 P = Obstacles()
-PATH = np.zeros((1, 2))
+PATH = np.zeros((1, 4))
 NOTHING = np.zeros((0, 3), np.float32)
 
 
