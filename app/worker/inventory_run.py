@@ -103,7 +103,7 @@ class InventoryRun:
     cache_notice = ""
 
     def __init__(self, source: CloudSource, parameters: Parameters) -> None:
-        self.source = source
+        self.source, self.warnings = source, source.description.warnings
         self.stopwatch = Stopwatch()
         self.frame: Frame | None = None
         self.confirmed_s: Float | None = None

@@ -300,14 +300,7 @@ class WorkerLoop:
         self._run, self._requested = self._run + 1, command.uri
         opening = f"Opening {command.uri}"
         self._put(protocol.Report(protocol.Status(state="starting", detail=opening, source=command.uri)))
-        opened = self._session.open(
-            command.uri,
-            command.odometry,
-            command.seed,
-            command.record,
-            publish=command.publish,
-            options=command.options(),
-        )
+        opened = self._session.open(command)
         if opened is not None:
             self._send_opened(opened)
 

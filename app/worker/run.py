@@ -7,8 +7,7 @@ mapped. It does not depend on pauses, jumps, or which states of the mapper are k
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 
 import msgspec
@@ -17,7 +16,7 @@ import numpy as np
 from app.common.timers import TOTAL, Stopwatch
 from app.explain.records import History
 from app.robot.source import LiveSource
-from app.sources.request import with_odometry
+from app.sources.request import SourceRequest, with_odometry
 from app.worker.course import QUANTITIES, STAGE, stage_times
 from app.worker.cursor import Cursor, StepStore, live_steps
 from app.worker.protocol import RunCounts, RunCourse, Shown
@@ -46,22 +45,13 @@ MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
 
 
 class Run:
-    """A source, mapped from its first scan to the current one. The constructor makes a mapper and raises
-    StemmapError if the random forest of the parameters does not exist.
+    """A source, mapped from its first scan to the current one.
 
     Args:
-        source: The source; `close` closes it.
-        make_mapper: Returns a mapper of this source before its first scan.
-        cursor: Reads the steps of the source.
+        source: The source; `close` closes it. A robot cannot be read again, and its frames are not stored.
+        request: How the source is mapped; its preset and parameters are not used.
         parameters: Parameters from the first scan onwards.
-        stopwatch: Measures the stages of the mapper.
-        odometry: Description of the source of motion.
-        is_live: Whether the source is a robot: its scans cannot be read again, and their frames are not
-            stored.
-        caches: Caches of the segmented scans of this source.
-        warnings: Warnings about the source.
-        left_out: Dict from reasons to numbers of records that the cursor left out; it grows while the source
-            is read.
+        make_mapper: Returns a new mapper.
 
     Attributes:
         frame: Result of the current scan; None before the first.
@@ -69,39 +59,49 @@ class Run:
             scan], NaN for trees that were never confirmed; None before the first scan.
         current: Index of the current scan; -1 before the first.
         is_bare: Whether the frame has no points, see `map_next`.
-        warnings: Warnings about the source, to which those of a robot are added.
+        odometry: Description of the source of motion.
+        warnings: Warnings about the odometry and the source, to which those of a robot are added.
+
+    Raises:
+        SourceError: The odometry is not available for this source.
+        StemmapError: The random forest of the parameters does not exist.
     """
 
     def __init__(
         self,
-        source: Source,
-        make_mapper: Callable[[Parameters], Mapper],
-        cursor: Cursor,
+        source: Source | LiveSource,
+        request: SourceRequest,
         parameters: Parameters,
-        stopwatch: Stopwatch,
-        odometry: str,
-        caches: ScanCaches,
-        *,
-        is_live: bool,
-        warnings: tuple[str, ...] = (),
-        left_out: Mapping[str, int] | None = None,
+        make_mapper: MakeMapper,
     ) -> None:
-        self.source = source
-        self.warnings = list(warnings)
-        self._left_out = {} if left_out is None else left_out  # an empty one is filled later
-        self.odometry = odometry
-        self.stopwatch = stopwatch
+        moving, chosen = with_odometry(source, request.odometry)
+        live, left_out = source if isinstance(source, LiveSource) else None, Counter[str]()
+
+        def read() -> Iterator[Step | None]:
+            if live is not None:
+                return live_steps(live, chosen, moving, left_out)
+            left_out.clear()  # the source is read from its start
+            return steps(moving.records(), odometry=chosen.steps, losses=left_out)
+
+        self.source, self.odometry = moving, chosen.words
+        self.warnings = [*([chosen.warning] if chosen.warning else []), *source.description.warnings]
+        self._left_out, self._is_live = left_out, live is not None
+        self.stopwatch = Stopwatch()
         self.frame: Frame | None = None
         self.confirmed_s: Float | None = None
         self.current = -1
         self.is_bare = False
-        self._cursor, self._is_live = cursor, is_live
-        self._make_mapper = make_mapper
-        self._map = self._new_map(make_mapper(parameters))
+
+        def mapper(values: Parameters) -> Mapper:
+            return make_mapper(moving.description, values, request.seed, self.stopwatch)
+
+        self._make_mapper = mapper
+        self._map = self._new_map(self._make_mapper(parameters))
+        self._cursor = Cursor(read, source.description.uri, None if self._is_live else StepStore())
         self._step: Step | None = None
         self._broken = False
-        self._caches = caches
-        self._cache = caches.of(parameters)
+        self._caches = ScanCaches()
+        self._cache = self._caches.of(parameters)
         self._numbers = TreeNumbers()
         self._views_sent = 0
         self._odometry_xy = GrowingColumns(np.zeros((0, 2)))  # x, y of each scan
@@ -489,59 +489,6 @@ class Run:
         self._caches.close()
         self._cursor.close()
         self.source.close()
-
-
-def open_run(
-    source: Source | LiveSource,
-    odometry: str,
-    seed: int,
-    parameters: Parameters,
-    make_mapper: MakeMapper,
-) -> tuple[Run, tuple[str, ...]]:
-    """Return a run before its first scan, and warnings about its odometry and its source, which the run has
-    as well.
-
-    Args:
-        source: The source; the run closes it.
-        odometry: Choice of the odometry, see `SourceRequest`.
-        seed: Random seed.
-        parameters: Parameters from the first scan onwards.
-        make_mapper: Returns a new mapper.
-
-    Raises:
-        SourceError: The odometry is not available for this source; the source is closed.
-        StemmapError: The random forest of the parameters does not exist; the source is closed.
-    """
-    with ExitStack() as on_error:
-        on_error.callback(source.close)
-        moving, chosen = with_odometry(source, odometry)
-        stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
-        description = source.description
-        left_out = Counter[str]()
-        if live is None:
-
-            def read() -> Iterator[Step]:
-                left_out.clear()  # the source is read from its start
-                return steps(moving.records(), odometry=chosen.steps, losses=left_out)
-
-            cursor = Cursor(read, description.uri, StepStore())
-        else:
-            cursor = Cursor(lambda: live_steps(live, chosen, moving, left_out), description.uri)
-        warnings = (*([chosen.warning] if chosen.warning else []), *description.warnings)
-        run = Run(
-            moving,
-            lambda parameters: make_mapper(moving.description, parameters, seed, stopwatch),
-            cursor,
-            parameters,
-            stopwatch,
-            chosen.words,
-            ScanCaches(),
-            is_live=live is not None,
-            warnings=warnings,
-            left_out=left_out,
-        )
-        on_error.pop_all()
-    return run, warnings
 
 
 def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Parameters], ...]:

@@ -24,6 +24,7 @@ from app.worker.protocol import (
     CameraPicture,
     CloudFrame,
     MapChanges,
+    Open,
     Opened,
     RunCounts,
     Shown,
@@ -31,7 +32,7 @@ from app.worker.protocol import (
     Status,
 )
 from app.worker.remap import MapComparison
-from app.worker.run import MakeMapper, Run, open_run
+from app.worker.run import MakeMapper, Run
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.inventory import PARAMETERS
@@ -81,8 +82,7 @@ class Session:
         self._make_mapper = make_mapper
         self._parameters = parameters
         self._revision = 0
-        self._requested: tuple[str, str, int] | None = None
-        self._open_again: Callable[[], Opened | None] = lambda: None
+        self._request: Open | None = None
         self._run: AnyRun | None = None
         self._robot: LiveSource | None = None
         self._state: State = "starting"
@@ -160,23 +160,9 @@ class Session:
         live scan arrived. Raises SourceError if nothing more can be read."""
         return self._run.peek_ns() if self._run else None
 
-    def open(
-        self,
-        uri: str,
-        odometry: str,
-        seed: int,
-        record: str = "",
-        *,
-        publish: bool = False,
-        options: SourceOptions | None = None,
-    ) -> Opened | None:
-        """Close the present run and open another source, paused before its first scan.
-
-        Args:
-            uri, odometry, seed: As in `SourceRequest`.
-            record: File to which a live run is recorded; empty for none.
-            publish: Whether the results of a live run are published on the network of the robot.
-            options: Topics and mounting; their seed is replaced by `seed`.
+    def open(self, request: Open) -> Opened | None:
+        """Close the present run and open another source, paused before its first scan; preset and parameters
+        of the request are not used.
 
         Returns:
             The opened run; None for a robot that has not sent scans yet, see `listen`.
@@ -187,19 +173,18 @@ class Session:
                 compiles cannot be started.
         """
         self.close()
-        self._requested = uri, odometry, seed
-        self._open_again = lambda: self.open(uri, odometry, seed, record, publish=publish, options=options)
-        source = self._open_source(uri, replace(options or SourceOptions(), seed=seed))
+        self._request, record = request, request.record
+        source = self._open_source(request.uri, request.options())
         if isinstance(source, LiveSource):
             try:
-                source.start(Recorder(FilePath(record)) if record else None, publish=publish)
+                source.start(Recorder(FilePath(record)) if record else None, publish=request.publish)
             except SourceError:
                 source.close()
                 raise
             self._robot, self._state, self._detail = source, "waiting", ""
             self._warm_up()
             return None
-        return self._begin(source, odometry, seed)
+        return self._begin(source, request)
 
     def listen(self) -> Opened | None:
         """Process what a live robot sent, without waiting. Return its run, opened and paused before the first
@@ -211,36 +196,35 @@ class Session:
             StemmapError: The random forest of the parameters does not exist. After this error, and for an
                 odometry that is not available, the source is closed.
         """
-        if self._robot is None or self._requested is None:
+        if self._robot is None or self._request is None:
             return None
         is_heard = self._run is None and self._robot.listen()
         notices = self._robot.notices()
         self._warn(notices)
-        opened = self._begin(self._robot, *self._requested[1:]) if is_heard else None
+        opened = self._begin(self._robot, self._request) if is_heard else None
         if isinstance(self._run, Run):
             self._run.warnings += notices
         return opened
 
-    def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
+    def _begin(self, source: Source | LiveSource, request: Open) -> Opened:
         """Open a run of a source, paused before its first scan, and return its message.
-
-        Args:
-            source: The source.
-            odometry, seed: As in `SourceRequest`.
 
         Raises:
             SourceError: The odometry is not available for this source; the source is closed.
             StemmapError: The random forest of the parameters does not exist; the source is closed.
         """
-        warnings: tuple[str, ...]
-        if isinstance(source, CloudSource):
-            self._run = InventoryRun(source, self._parameters)
-            warnings = source.description.warnings
-        else:
-            self._run, warnings = open_run(source, odometry, seed, self._parameters, self._make_mapper)
-        self._state, self._detail = "paused", ""
-        self._warn(warnings)
-        return opened_of(self._run)
+        run: AnyRun
+        try:
+            if isinstance(source, CloudSource):
+                run = InventoryRun(source, self._parameters)
+            else:
+                run = Run(source, request, self._parameters, self._make_mapper)
+        except BaseException:
+            source.close()
+            raise
+        self._run, self._state, self._detail = run, "paused", ""
+        self._warn(run.warnings)
+        return opened_of(run)
 
     def prepare(self) -> None:
         """Compile the kernels by mapping the first scan, whose result is discarded. It can take minutes the
@@ -307,7 +291,7 @@ class Session:
         if self._run is None and self._robot is not None and self._state != "failed":
             return None  # it plays when scans arrive
         if self._run is None or self._state == "failed":
-            opened = self._open_again()
+            opened = None if self._request is None else self.open(self._request)
         elif self._state == "finished":
             self._target.to_scan(0)
         if self._run is not None:
@@ -454,7 +438,7 @@ class Session:
         status = Status(
             state=self._state,
             detail=self._detail,
-            source=self._requested[0] if self._requested else "",
+            source=self._request.uri if self._request else "",
             time_s=self.time_s,
             warnings=list(self._warnings),
             revision=self._revision,

@@ -12,7 +12,7 @@ import pytest
 from app.dashboard.payload import binary_payload, in_centimetres, stages_payload
 from app.worker.loop import WorkerLoop
 from app.worker.process import new_session
-from app.worker.protocol import Answer, AskCompare, FromWorker, Shown, ToWorker
+from app.worker.protocol import Answer, AskCompare, FromWorker, Open, Shown, ToWorker
 from app.worker.session import Session
 from pipeline.config import Parameters, preset
 from pipeline.errors import StemmapError
@@ -42,7 +42,7 @@ def frames_of(session: Session, after: int) -> list[Frame]:
 def test_a_comparison_leaves_no_trace_in_the_run():
     session, other = new_session(), new_session()
     for each in (session, other):
-        each.open("sim:stand?duration=3", "auto", 3)
+        each.open(Open("sim:stand?duration=3", "auto", 3))
         stand_at(each, 12)
     sets = [preset("paper"), preset("forest"), Parameters().replace({"clustering.eps": 0.6})]
     compared = session.compare(sets)
@@ -62,7 +62,7 @@ def test_what_is_compared_is_not_measured_and_a_failure_leaves_the_run_whole():
     session = make_session(FakeSource(6))
     with pytest.raises(StemmapError, match="nothing is mapped"):
         session.compare([Parameters()])
-    session.open("fake:", "auto", 0)
+    session.open(Open("fake:", "auto", 0))
     with pytest.raises(StemmapError, match="no scan is mapped yet"):
         session.compare([Parameters()])
     first = stand_at(session, 2)
@@ -81,7 +81,7 @@ def test_the_worker_answers_with_pictures_without_raw_points():
     waiting: queue.Queue[ToWorker | None] = queue.Queue()
     said: list[FromWorker] = []
     session = make_session(FakeSource(4))
-    session.open("fake:", "auto", 0)
+    session.open(Open("fake:", "auto", 0))
     stand_at(session, 1)
     values = [Parameters().model_dump(), {**Parameters().model_dump(), "slam": {"particles": -1}}]
     for message in (AskCompare(1, 0, values[:1]), AskCompare(2, 0, values), AskCompare(3, 5, []), None):

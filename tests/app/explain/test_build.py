@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from app.explain.build import cluster_story, tree_story
+from app.worker.protocol import Open
 from app.worker.session import Session
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame, Verdict
@@ -96,7 +97,7 @@ def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):
     from pipeline.config import preset
 
     mapped = new_session()
-    mapped.open("sim:paper?duration=1", "auto", 3)
+    mapped.open(Open("sim:paper?duration=1", "auto", 3))
     mapped.set_parameters(preset("paper"), 1)
     mapped.play()
     while mapped.pace == "replay":

@@ -12,6 +12,7 @@ import pytest
 from app.robot.address import parse_address
 from app.robot.source import LiveSource
 from app.worker.process import new_session
+from app.worker.protocol import Open
 from pipeline.config import Parameters
 from pipeline.io.readers import open_source
 from pipeline.io.readers.container import Message
@@ -58,7 +59,7 @@ class Robot:
 
         self.session = new_session()
         self.session._open_source = lambda uri, options: LiveSource(parse_address(uri), options, link)
-        self.session.open(URI, "auto", SEED)
+        self.session.open(Open(URI, "auto", SEED))
         (self._link,) = links
         announce(self._link, self)
         self._opened = False

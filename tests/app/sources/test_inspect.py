@@ -204,7 +204,7 @@ def test_a_run_that_failed_is_opened_again_with_the_same_choice():
         make_mapper=make_mapper,
         parameters=Parameters(),
     )
-    session.open("fake:", "auto", 5, options=SourceOptions({"scan": "/other"}))
+    session.open(Open("fake:", "auto", 5, {"scan": "/other"}))
     session.fail("the file is cut")
     session.play()
     assert asked == [SourceOptions({"scan": "/other"}, None, 5)] * 2

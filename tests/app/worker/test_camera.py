@@ -19,6 +19,7 @@ from app.worker.protocol import (
     AskCamera,
     AskTreePicture,
     CameraPicture,
+    Open,
     Shown,
     ToWorker,
     from_worker,
@@ -153,7 +154,7 @@ def test_a_picture_travels_between_the_processes(source: RosSource):
 
 def test_the_best_picture_of_a_tree_is_one_that_shows_it(source: RosSource):
     session = new_session()
-    session.open(source.description.uri, "auto", 3)
+    session.open(Open(source.description.uri, "auto", 3))
     session.play()
     while session.pace == "replay":
         session.work()

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from app.dashboard.payload import course_payload
 from app.worker.course import QUANTITIES, ScanSeries, stage_times
+from app.worker.protocol import Open
 from app.worker.run import Run
 from app.worker.session import Session
 from pipeline.config import Parameters
@@ -45,7 +46,7 @@ def test_a_scan_that_is_mapped_again_replaces_its_known_values_and_forgotten_one
 
 def opened(scans: int) -> Session:
     session = make_session(FakeSource(scans))
-    session.open("fake:", "auto", 7)
+    session.open(Open("fake:", "auto", 7))
     return session
 
 

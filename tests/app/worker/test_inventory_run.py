@@ -13,7 +13,7 @@ from app.explain.build import cluster_story, tree_story
 from app.explain.build import section as at_breast
 from app.worker.outbox import picture_of
 from app.worker.process import new_session, open_any_or_cloud
-from app.worker.protocol import Report, Shown, from_worker
+from app.worker.protocol import Open, Report, Shown, from_worker
 from app.worker.session import Session, tree_picture
 from pipeline.config import preset
 from pipeline.errors import SourceError, StemmapError
@@ -38,7 +38,7 @@ def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def session(cloud: Path) -> Iterator[Session]:
     opened = new_session()
-    opened.open(str(cloud), "auto", 0)
+    opened.open(Open(str(cloud), "auto", 0))
     opened.set_parameters(FOREST, 1)
     yield opened
     opened.close()
@@ -244,7 +244,7 @@ def test_a_damaged_cloud_is_refused_and_the_address_of_a_drive_is_no_map(cloud: 
 
 def test_a_run_of_scans_follows_a_cloud(session: Session) -> None:
     mapped(session)
-    session.open("sim:stand?duration=2", "auto", 0)
+    session.open(Open("sim:stand?duration=2", "auto", 0))
     session.set_parameters(FOREST, 2)
     assert session.status().cloud is None
     session.advance(1)

@@ -217,7 +217,7 @@ def test_of_a_slider_that_moves_only_the_last_value_is_mapped() -> None:
     commands: queue.Queue[ToWorker | None] = queue.Queue()
     session = make_session(FakeSource(9))
     said: list[FromWorker] = []
-    session.open("fake:", "auto", 0)
+    session.open(Open("fake:", "auto", 0))
     session.advance(1)
     while session.pace == "hurry":
         session.work()

@@ -20,6 +20,7 @@ import sys
 from numba.core.dispatcher import Dispatcher
 from app.worker.numba_warmup import compiled_share, is_compiled, map_scene, warm_tree_map, warm_up
 from app.worker.process import new_session
+from app.worker.protocol import Open
 from pipeline.config import Parameters
 
 def seen():
@@ -38,7 +39,7 @@ before = seen()
 assert len(before) > 20, before
 warm_up()
 session = new_session()
-session.open("sim:stand?duration=1", "auto", 0)
+session.open(Open("sim:stand?duration=1", "auto", 0))
 session.set_parameters(Parameters(), 0)
 session.advance(10)
 while session.pace == "hurry":

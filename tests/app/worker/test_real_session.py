@@ -15,7 +15,7 @@ from app.cli import main
 from app.dashboard.shown_run import ShownRun
 from app.sources.request import SourceRequest
 from app.worker.process import new_session
-from app.worker.protocol import Shown
+from app.worker.protocol import Open, Shown
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.io.atomic_files import write_texts
@@ -29,7 +29,7 @@ URI = "sim:stand?duration=7"
 @pytest.fixture
 def session():
     session = new_session()
-    session.open(URI, "auto", 3)
+    session.open(Open(URI, "auto", 3))
     yield session
     session.close()
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from app.worker.process import new_session
-from app.worker.protocol import MapChanges
+from app.worker.protocol import MapChanges, Open
 from app.worker.run import Run
 from app.worker.session import Session
 from pipeline.config import Parameters
@@ -54,7 +54,7 @@ def settle(session: Session) -> None:
 def session() -> Iterator[Session]:
     """A run that stands at its last scan but one."""
     with closing(new_session()) as opened:
-        opened.open(URI, "auto", 3)
+        opened.open(Open(URI, "auto", 3))
         opened.set_parameters(BASE, 0)
         opened.advance(LAST)
         settle(opened)
@@ -65,7 +65,7 @@ def session() -> Iterator[Session]:
 def mapped_from_start(parameters: Parameters, last: int) -> Iterator[Session]:
     """A run that was mapped with some parameters from the start."""
     with closing(new_session()) as opened:
-        opened.open(URI, "auto", 3)
+        opened.open(Open(URI, "auto", 3))
         opened.set_parameters(parameters, 0)
         opened.advance(last + 1)
         settle(opened)
@@ -177,7 +177,7 @@ def test_trees_that_stay_keep_their_numbers():
     none = BASE.replace({"classification.tree_share": 1.0, "tracking.hits_to_confirm": 200})
     eps = BASE.replace({"clustering.eps": 0.25})
     with closing(new_session()) as session:
-        session.open("sim:stand?duration=4", "auto", 3)
+        session.open(Open("sim:stand?duration=4", "auto", 3))
         session.set_parameters(BASE, 0)
         session.advance(32)
         settle(session)
@@ -362,7 +362,7 @@ def test_what_cannot_be_read_again_leaves_the_map_and_says_so(session, monkeypat
 
 def test_it_tells_which_trees_came_and_went_and_why():
     with closing(new_session()) as session:
-        session.open("sim:paper?duration=12", "auto", 3)
+        session.open(Open("sim:paper?duration=12", "auto", 3))
         session.set_parameters(BASE, 0)
         session.advance(120)
         settle(session)
@@ -427,7 +427,7 @@ def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
 def test_without_room_for_the_scans_they_are_read_once_more_and_that_is_said(monkeypatch):
     monkeypatch.setattr("pipeline.io.block_file.SPARE_BYTES", 1 << 62)
     with closing(new_session()) as session:
-        session.open(URI, "auto", 3)
+        session.open(Open(URI, "auto", 3))
         session.set_parameters(BASE, 0)
         session.advance(8)
         settle(session)

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.worker.protocol import Status
-from app.worker.run import open_run
+from app.worker.protocol import Open, Status
 from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
@@ -36,7 +35,7 @@ def settle(session: Session) -> Frame | None:
 
 def opened(scans: int = SCANS, **source: object) -> Session:
     session = make_session(FakeSource(scans, **source))  # type: ignore[arg-type]
-    session.open("fake:", "auto", 7)
+    session.open(Open("fake:", "auto", 7))
     return session
 
 
@@ -246,7 +245,7 @@ def test_a_change_on_the_way_acts_from_the_sought_scan_on(
 def test_targets_that_are_overtaken_cost_nothing() -> None:
     source = FakeSource(SCANS)
     session = make_session(source)
-    session.open("fake:", "auto", 7)
+    session.open(Open("fake:", "auto", 7))
     session.advance(120)
     settle(session)
     for index in range(100, 0, -1):
@@ -373,26 +372,26 @@ def test_the_status_says_where_a_seek_goes_until_it_is_there() -> None:
 def test_what_the_odometry_means_is_a_warning_or_a_failure() -> None:
     source = FakeSource(5)
     session = make_session(source)
-    session.open("fake:", "static", 0)
+    session.open(Open("fake:", "static", 0))
     assert ["static" in warning for warning in session.status().warnings] == [True]
     source.description = replace(source.description, has_odometry=False, scans=1)
-    session.open("fake:", "auto", 0)
+    session.open(Open("fake:", "auto", 0))
     assert ["no odometry" in warning for warning in session.status().warnings] == [True]
     with pytest.raises(SourceError, match="no odometry"):
-        session.open("fake:", "wheels", 0)
+        session.open(Open("fake:", "wheels", 0))
     assert source.closed
 
 
 def test_opening_another_source_closes_the_first() -> None:
     source = FakeSource(5)
     session = make_session(source)
-    session.open("fake:", "auto", 0)
+    session.open(Open("fake:", "auto", 0))
     with pytest.raises(SourceError):
-        session.open("missing:", "auto", 0)
+        session.open(Open("missing:", "auto", 0))
     assert source.closed
     session.fail("there is no such file (missing:)")
     assert session.status().source == "missing:"
-    session.open("fake:", "auto", 0)
+    session.open(Open("fake:", "auto", 0))
     assert session.status().state == "paused"
     assert session.frame is None
 
@@ -430,7 +429,7 @@ def test_a_source_that_gives_other_scans_the_second_time_cannot_go_back_without_
 def test_without_stored_steps_the_source_is_read_again_from_its_start() -> None:
     source = FakeSource(SCANS)
     session = make_session(source)
-    session.open("fake:", "auto", 0)
+    session.open(Open("fake:", "auto", 0))
     session.advance(110)
     settle(session)
     session.advance(-1)
@@ -499,5 +498,5 @@ def test_a_source_without_a_mapper_is_closed() -> None:
 
     source = FakeSource(3)
     with pytest.raises(StemmapError, match="oak"):
-        open_run(source, "auto", 7, Parameters(), refuses)
+        Session(lambda *_: source, refuses, Parameters()).open(Open("fake:"))
     assert source.closed

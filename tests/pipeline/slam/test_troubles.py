@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from app.batch.summary import health_word
+from app.worker.protocol import Open
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Pose3
@@ -78,7 +79,7 @@ def lived(place: str, seed: int, name: str, p: Parameters | None = None) -> Day:
         ),
         parameters=parameters() if p is None else p,
     )
-    session.open("told:", "auto", seed)
+    session.open(Open("told:", "auto", seed))
     session.play()
     rows: list[tuple[int, Frame, str, tuple[str, ...]]] = []
     while (frame := session.work()) is not None:
