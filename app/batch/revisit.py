@@ -397,36 +397,20 @@ _SYMBOLS = {
 def comparison_map(rows: list[dict[str, Any]]) -> str:
     """Return a map of the trees of `rows_of`, at least one, by their status as SVG, with a scale bar and a
     legend; significant growth is a filled circle with a ring."""
+    from jinja2 import Environment, PackageLoader
+
     place = np.array([[row["x_m"], row["y_m"]] for row in rows], np.float64).reshape(-1, 2)
     low, high = place.min(axis=0) - 2.0, place.max(axis=0) + 2.0
     scale = 180.0 / max(float((high - low).max()), 1.0)
-    width, height = (high - low) * scale
-    parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width + 45:.1f} {max(height, 57) + 10:.1f}" '
-        f'style="font:3px sans-serif"><rect width="{width:.1f}" height="{height:.1f}" fill="#fff" '
-        f'stroke="#555" stroke-width=".3"/>'
-    ]
-    for row, (x, y) in zip(rows, (place - low) * scale, strict=True):
-        fill, line = _SYMBOLS[row["status"]]
-        at = f'cx="{x:.2f}" cy="{height - y:.2f}"'
-        parts.append(f'<circle {at} r="1.3" fill="{fill}" stroke="{line}" stroke-width=".4"/>')
-        if row["significant"]:
-            parts.append(f'<circle {at} r="2.1" fill="none" stroke="{line}" stroke-width=".3"/>')
-        number = row["tree_a"] if row["tree_a"] is not None else row["tree_b"]
-        parts.append(
-            f'<text x="{x + 2.4:.2f}" y="{height - y + 1:.2f}" style="font-size:2.2px">{number}</text>'
-        )
-    for k, (status, (fill, line)) in enumerate(_SYMBOLS.items()):
-        y = 5 + 6 * k
-        n = sum(1 for row in rows if row["status"] == status)
-        parts.append(
-            f'<circle cx="{width + 4:.1f}" cy="{y}" r="1.3" fill="{fill}" stroke="{line}" stroke-width=".4"/>'
-            f'<text x="{width + 7:.1f}" y="{y + 1}">{status} ({n})</text>'
-        )
-    parts.append(
-        f'<circle cx="{width + 4:.1f}" cy="53" r="2.1" fill="none" stroke="#333" stroke-width=".3"/>'
-        f'<text x="{width + 7:.1f}" y="54">significant growth</text>'
-        f'<path d="M0 {height + 2:.1f} v2 h{5 * scale:.2f} v-2" fill="none" stroke="#111" stroke-width=".4"/>'
-        f'<text x="{5 * scale + 2:.1f}" y="{height + 5:.1f}">5 m</text></svg>\n'
+    width, height = ((high - low) * scale).tolist()
+    environment = Environment(
+        loader=PackageLoader("app.batch", "."), autoescape=True, trim_blocks=True, keep_trailing_newline=True
     )
-    return "".join(parts)
+    at = (place - [low[0], high[1]]) * [scale, -scale]
+    return environment.get_template("comparison.svg.j2").render(
+        trees=[(row, x, y) for row, (x, y) in zip(rows, at.tolist(), strict=True)],
+        symbols=_SYMBOLS,
+        width=width,
+        height=height,
+        scale=scale,
+    )
