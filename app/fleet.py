@@ -706,8 +706,6 @@ def serve_fleet(
     sources: Mapping[str, Open],
     make_parameters: Callable[[], ParameterState],
     watched: tuple[ZenohAddress, Open] | None,
-    open_browser: bool,
-    viewer: bool,
 ) -> int:
     """Serve until SIGINT or SIGTERM; return the exit code, see `run_server`.
 
@@ -716,8 +714,6 @@ def serve_fleet(
         sources: Runs that are open from the start, by name.
         make_parameters: Returns the initial parameters of a dashboard.
         watched: A router whose robots are added when they appear, and how they are opened; None for none.
-        open_browser: Whether to open the page in the browser of this machine.
-        viewer: Whether to print the view-only link.
 
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
@@ -734,4 +730,4 @@ def serve_fleet(
             watching = RobotWatch(fleet, address, source)
         return build_fleet(settings, port=port, tokens=tokens, fleet=fleet, watching=watching)
 
-    return run_server(settings, make_app, open_browser=open_browser, viewer=viewer)
+    return run_server(settings, make_app)

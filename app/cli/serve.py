@@ -63,7 +63,9 @@ def run(arguments: argparse.Namespace) -> int:
     from app.common.settings import from_environment
     from app.sources.opening import check_address
 
-    settings = from_environment()
+    settings = replace(
+        from_environment(), opens_browser=not arguments.no_browser, prints_viewer_link=arguments.viewer
+    )
     if arguments.host is not None:
         settings = replace(settings, host=arguments.host)
     if arguments.port is not None:
@@ -95,16 +97,8 @@ def run(arguments: argparse.Namespace) -> int:
             sources={} if watched is not None else named(sources),
             make_parameters=make_parameters,
             watched=watched,
-            open_browser=not arguments.no_browser,
-            viewer=arguments.viewer,
         )
-    return serve(
-        settings,
-        source=sources[0],
-        parameter_state=make_parameters(),
-        open_browser=not arguments.no_browser,
-        viewer=arguments.viewer,
-    )
+    return serve(settings, source=sources[0], parameter_state=make_parameters())
 
 
 def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:

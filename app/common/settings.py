@@ -54,6 +54,8 @@ class Settings:
         upload_limit: Maximum size of an uploaded recording [bytes].
         files: Files that an owner may open: "any", "folders" (recordings in the data folders), or "" for any
             file in requests from this machine and only the data folders in others.
+        opens_browser: Whether the page is opened in the browser of this machine.
+        prints_viewer_link: Whether the view-only link is printed at the start.
     """
 
     host: str = DEFAULT_HOST
@@ -64,6 +66,8 @@ class Settings:
     upload_limit: int = 20_000_000_000
     folder: Path | None = None
     files: Files = ""
+    opens_browser: bool = False
+    prints_viewer_link: bool = False
 
     @property
     def uploads(self) -> Path | None:

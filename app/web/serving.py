@@ -127,8 +127,6 @@ def serve(
     *,
     source: Open,
     parameter_state: ParameterState,
-    open_browser: bool,
-    viewer: bool = False,
 ) -> int:
     """Serve the dashboard until SIGINT or SIGTERM; return the exit code, see `run_server`.
 
@@ -136,8 +134,6 @@ def serve(
         settings: Settings of the deployment.
         source: Source that is opened at the start.
         parameter_state: Parameters at the start.
-        open_browser: Whether to open the page in the browser of this machine.
-        viewer: Whether to print the view-only link.
 
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
@@ -158,24 +154,16 @@ def serve(
             make_worker=lambda: worker,
         )
 
-    return run_server(settings, make_app, open_browser=open_browser, viewer=viewer)
+    return run_server(settings, make_app)
 
 
-def run_server(
-    settings: Settings,
-    make_app: Callable[[int, AccessTokens], Awaitable[ASGIApp]],
-    *,
-    open_browser: bool,
-    viewer: bool,
-) -> int:
+def run_server(settings: Settings, make_app: Callable[[int, AccessTokens], Awaitable[ASGIApp]]) -> int:
     """Serve an application until SIGINT or SIGTERM and print its link; return the exit code: 0, or 1 if the
     server ended before it was ready.
 
     Args:
         settings: Settings of the deployment; without a token a random one is used.
         make_app: Awaited with port and tokens; returns the application. Its exceptions pass through.
-        open_browser: Whether to open the page in the browser of this machine.
-        viewer: Whether to print the view-only link.
 
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
@@ -184,12 +172,12 @@ def run_server(
     listening = bind(settings)
     port = listening.getsockname()[1]
     tokens = AccessTokens.of(settings)
-    if viewer:
+    if settings.prints_viewer_link:
         print(f"View-only link: {link_of(settings, port, tokens.viewer)}", flush=True)  # noqa: T201
 
     async def served() -> bool:
         config, link = uvicorn_config(await make_app(port, tokens)), link_of(settings, port, tokens.owner)
-        server = LinkedServer(config, settings, link, open_browser=open_browser)
+        server = LinkedServer(config, settings, link)
         await server.serve(sockets=[listening])
         return server.started
 
@@ -301,11 +289,10 @@ def bound(host: str, port: int) -> socket.socket:
 class LinkedServer(uvicorn.Server):
     """uvicorn server that prints its link when it is ready and ends without a traceback."""
 
-    def __init__(self, config: uvicorn.Config, settings: Settings, link: str, *, open_browser: bool) -> None:
+    def __init__(self, config: uvicorn.Config, settings: Settings, link: str) -> None:
         super().__init__(config)
         self._settings = settings
         self._link = link
-        self._open_browser = open_browser
         self._until_the_end = contextlib.ExitStack()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -319,7 +306,7 @@ class LinkedServer(uvicorn.Server):
                 file=sys.stderr,
             )
         print(f"stemmap is ready: {self._link}", flush=True)  # noqa: T201
-        if self._open_browser and _has_display():
+        if self._settings.opens_browser and _has_display():
             page = self._until_the_end.enter_context(page_that_leads_to(self._link))
             threading.Thread(target=show_in_browser, args=(page,), daemon=True).start()
 
