@@ -36,8 +36,6 @@ _WRITE_LIMIT_S = 5.0
 # Longest time without a message while a run plays or a command is executed. A part of it is reported before.
 SILENCE_LIMIT_S = 30.0
 _NOTICE_SHARE = 6
-# Consecutive ends without a result after which the playback speed is reset, which may be the cause.
-_SUSPICIOUS_ENDS = 2
 # Commands that are stored and sent again after a restart, or that a new process does not need.
 _REMEMBERED = (
     protocol.SetParameters,
@@ -85,7 +83,6 @@ class WorkerProcess:
         self._pauses_s = _PAUSES_S
         self._deaths: deque[float] = deque(maxlen=len(_PAUSES_S))
         self._wanted = asyncio.Event()
-        self._ends_without_result = 0
         self._opening_limit_s = opening_limit_s
         self._opening: Literal["", "requested", "begun"] = ""
         self._opening_since = 0.0
@@ -195,7 +192,6 @@ class WorkerProcess:
                 )
             else:
                 self._deaths.append(self._clock())
-                self._ends_without_result += 1
                 await self._pause(reason)
                 self.restarts += 1
             await self.spawn()
@@ -304,8 +300,6 @@ class WorkerProcess:
         Errors of the function are logged and, except for a `Report`, reported as a failure; they do not end
         the supervision."""
         self._note_opening(message)
-        if isinstance(message, protocol.Shown):
-            self._ends_without_result = 0
         try:
             await self._on_message(message)
         except Exception as error:  # logged; it must not end the supervision of the worker
@@ -318,16 +312,12 @@ class WorkerProcess:
 
     async def _pause(self, reason: str) -> None:
         """Report the end and wait before the next start, 0.2 s to 4 s; after five ends within a minute, wait
-        for `Play` or `Open`. After two ends without a result the playback speed is no longer restored,
-        because it may be the cause.
+        for `Play` or `Open`.
 
         Args:
             reason: How the process ended, for people.
         """
         what = f"The mapping process ended ({reason})"
-        if self._ends_without_result >= _SUSPICIOUS_ENDS and protocol.SetSpeed in self._settings:
-            del self._settings[protocol.SetSpeed]
-            what += "; the playback speed was reset"
         recent = [t for t in self._deaths if self._clock() - t < _FORGIVEN_AFTER_S]
         if len(recent) < len(self._pauses_s):
             await self._report_failure(f"{what}; it is being started again")

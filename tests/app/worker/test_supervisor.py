@@ -297,18 +297,6 @@ async def test_a_command_while_the_worker_restarts_is_refused_and_not_lost(
     await said.scan(0)
 
 
-async def test_a_speed_that_ends_the_worker_is_dropped() -> None:
-    said = Said()
-    worker = WorkerProcess((sys.executable, "-c", "raise SystemExit(7)"))
-    worker_pauses_shortened(worker)
-    await worker.send(SetSpeed(1.0))
-    await worker.start(said)
-    try:
-        await said.wait(lambda m: isinstance(m, Report) and "speed was reset" in m.status.detail)
-    finally:
-        await worker.close()
-
-
 async def test_it_does_not_outlive_the_web_process() -> None:
     process = await asyncio.create_subprocess_exec(
         *FAKE, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
