@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.explain.history import half_axes
+from app.explain.records import half_axes
 from app.worker.course import QUANTITIES
 from app.worker.protocol import RunCourse, Shown
 from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from app.explain.history import half_axes
 from app.explain.records import (
     CheckResult,
     Circle,
@@ -20,6 +19,7 @@ from app.explain.records import (
     FeatureEffect,
     MapSection,
     TreeStory,
+    half_axes,
 )
 from app.store.forests import kept_forests
 from app.worker.inventory_run import InventoryRun

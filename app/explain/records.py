@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import msgspec
+import numpy as np
 
-from pipeline.types.records import Int32
+from pipeline.types.records import Float, Int32
 
 
 class CheckResult(msgspec.Struct, frozen=True):
@@ -244,3 +245,15 @@ class TreeStory(msgspec.Struct, frozen=True):
     height_hidden: str = ""
     lean_deg: float = math.nan
     sections: list[CrossSection] | None = None
+
+
+def half_axes(covariance: Float) -> Float:
+    """Return major half axis [m], minor half axis [m] and direction of the major axis [rad] of 1-sigma
+    ellipses, shape (T, 3). Either of the two opposite directions may be returned.
+
+    Args:
+        covariance: Covariances, shape (T, 2, 2) [m^2].
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    minor, major = np.sqrt(np.maximum(values, 0.0)).T
+    return np.stack([major, minor, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])], axis=1)

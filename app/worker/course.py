@@ -1,4 +1,5 @@
-"""What is known of each mapped scan of a run: quantities for charts, in bounded memory, and totals."""
+"""What is known of the mapped scans of a run: quantities for charts, totals, and the estimates of each tree
+over time, in bounded memory."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from app.batch.summary import warning_texts
 from app.common.timers import TOTAL
+from app.explain.records import History, half_axes
 from app.worker.protocol import RunCounts
 from pipeline.geometry.columns import GrowingColumns
 from pipeline.types.records import Float, Frame, Int, Verdict
@@ -207,3 +209,92 @@ class ScanCounts:
             {reason: n for reason, n in losses.items() if n},
             warning_texts(Counter(warnings) + self._warned[index])[:_MOST_WARNINGS],
         )
+
+
+_WIDTH = 11  # scan, number, observations, time, x, y, var x, cov xy, var y, DBH, its sigma
+_SCAN, _NUMBER, _OBSERVATIONS, _TIME = range(4)
+_MOST_ROWS = 200_000
+_ALL_OF_FIRST = 10  # observations; there the ellipse shrinks fastest
+_MOST_RETURNED = 200  # rows
+_NS = 1_000_000_000
+
+
+class TreeHistory:
+    """The estimate of each tree after every scan that detected it.
+
+    The first ten estimates of each tree are always kept. When more than 200,000 estimates are stored, the
+    later ones of every second scan are dropped, repeatedly.
+    """
+
+    def __init__(self) -> None:
+        self._rows = GrowingColumns(np.zeros((0, _WIDTH)))
+        self._spacing = 1
+
+    def record(self, frame: Frame, start_ns: int) -> None:
+        """Add a row for each tree that the scan detected, confirmed or not. Rows of this scan and of later
+        ones are removed first, because the run went back. Once rows were dropped, scans between the kept ones
+        add only the first ten estimates of a tree.
+
+        Args:
+            frame: Result of the scan.
+            start_ns: Time of the first scan of the run [ns].
+        """
+        known = self._rows.column(0)
+        first = int(np.searchsorted(known[:, _SCAN], frame.index))
+        self._rows.write(first, self._kept(_rows_of(frame, start_ns)))
+        while len(self._rows) > _MOST_ROWS and self._spacing < _MOST_ROWS:
+            self._spacing *= 2
+            self._rows.write(0, self._kept(self._rows.column(0)))
+
+    def last_places(self) -> dict[int, tuple[float, float]]:
+        """Return a dict from the number of each tree, also of trees that ended, to its newest stored position
+        (x, y) in the map [m]."""
+        known = self._rows.column(0)
+        return {int(number): (float(x), float(y)) for number, x, y in known[:, [_NUMBER, 4, 5]]}
+
+    def of(self, number: int, scan: int) -> History:
+        """Return the estimates of the tree with this number up to a scan (inclusive), in order of time: at
+        most 200 rows, denser at the beginning, the first and the last among them; empty columns for an
+        unknown tree."""
+        known = self._rows.column(0)
+        mine = known[(known[:, _NUMBER] == number) & (known[:, _SCAN] <= scan)]
+        if len(mine) > _MOST_RETURNED:  # denser for the first observations, where the ellipse changes fastest
+            place = np.unique(np.geomspace(1, len(mine), _MOST_RETURNED).astype(np.int64) - 1)
+            mine = mine[place]
+        ellipse = half_axes(mine[:, [[6, 7], [7, 8]]])
+        return History(
+            time_s=mine[:, _TIME].tolist(),
+            x=mine[:, 4].tolist(),
+            y=mine[:, 5].tolist(),
+            major=ellipse[:, 0].tolist(),
+            minor=ellipse[:, 1].tolist(),
+            angle=ellipse[:, 2].tolist(),
+            dbh=mine[:, 9].tolist(),
+            dbh_sigma=mine[:, 10].tolist(),
+        )
+
+    def _kept(self, rows: Float) -> Float:
+        """Return which of the rows, shape (R, _WIDTH), are stored with the present spacing of the scans."""
+        kept: Float = rows[(rows[:, _SCAN] % self._spacing == 0) | (rows[:, _OBSERVATIONS] <= _ALL_OF_FIRST)]
+        return kept
+
+
+def _rows_of(frame: Frame, start_ns: int) -> Float:
+    """Return a row for each tree that the scan detected, shape (R, _WIDTH): scan, number, observations,
+    time since `start_ns` [s], x, y in the map [m], covariance xx, xy, yy [m^2], DBH [m] and sigma of the
+    DBH [m]."""
+    trees = frame.trees
+    # A tree that began as a voxel column has a position before any scan detects it.
+    rows = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
+    return np.column_stack(
+        [
+            np.full(len(rows), frame.index),
+            trees.number[rows],
+            trees.observations[rows],
+            np.full(len(rows), (frame.stamp_ns - start_ns) / _NS),
+            trees.position[rows],
+            trees.covariance[rows][:, [0, 0, 1], [0, 1, 1]],
+            trees.dbh[rows],
+            trees.dbh_sigma[rows],
+        ]
+    )

@@ -29,9 +29,8 @@ import msgspec
 
 from app.common.text import COMPILING
 from app.explain.build import cluster_story, section, tree_story
-from app.explain.history import RecentScans
 from app.worker import protocol
-from app.worker.outbox import for_comparison
+from app.worker.outbox import RecentScans, for_comparison
 from app.worker.session import Session, camera_picture, tree_picture
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError

@@ -1,17 +1,17 @@
-"""Outgoing messages of the worker: only the newest frame is sent, all other messages are kept."""
+"""Outgoing messages of the worker: only the newest frame is sent, all other messages are kept; and the scans
+that were sent last."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from dataclasses import replace
 from typing import BinaryIO
 
 import numpy as np
 from msgspec import structs
 
-from app.explain.history import RecentScans
 from app.worker.protocol import FromWorker, Opened, Report, Shown, WireError, from_worker
 from pipeline.geometry.columns import evenly_spaced, rows_in_common, rows_of
 from pipeline.types.records import Frame, HeightMap, Path
@@ -209,3 +209,44 @@ def for_comparison(frame: Frame) -> Frame:
     """Return the frame for the comparison of parameter sets: as `picture_of`, without raw points, voxel
     columns and ground, which do not depend on the parameters or are not rendered."""
     return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))
+
+
+_MOST_SCANS = 60  # at twenty scans per second a click may be three seconds old
+
+
+class RecentScans:
+    """The 60 scans that were sent to the browsers last, without their raw points. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def keep(self, run: int, frame: Frame) -> None:
+        """Store a scan without its raw points, in place of an earlier result of the same scan. Beyond
+        _MOST_SCANS, the scans that were stored first are removed.
+
+        Args:
+            run: Number of the run.
+            frame: Results of the scan.
+        """
+        small = replace(frame, raw=np.zeros((0, 3), np.float32))
+        with self._lock:
+            self._frames[run, frame.index] = small
+            self._frames.move_to_end((run, frame.index))
+            while len(self._frames) > _MOST_SCANS:
+                self._frames.popitem(last=False)
+
+    def forget(self) -> None:
+        """Remove all scans."""
+        with self._lock:
+            self._frames.clear()
+
+    def find(self, run: int, scan: int) -> Frame | None:
+        """Return a scan as it was sent last, but with an empty `raw`; None if it is not stored.
+
+        Args:
+            run: Number of the run.
+            scan: Index of the scan.
+        """
+        with self._lock:
+            return self._frames.get((run, scan))

@@ -16,11 +16,10 @@ from typing import BinaryIO
 
 from app.common.child_process import private_streams
 from app.common.text import COMPILING
-from app.explain.history import RecentScans
 from app.robot.source import LiveSource
 from app.worker.inventory_run import CloudSource
 from app.worker.loop import WorkerLoop
-from app.worker.outbox import Outbox
+from app.worker.outbox import Outbox, RecentScans
 from app.worker.protocol import ToWorker, WireError, to_worker
 from app.worker.session import Session
 from pipeline.config import Parameters

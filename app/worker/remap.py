@@ -15,8 +15,7 @@ from typing import Generic, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from app.explain.history import TreeHistory
-from app.worker.course import ScanCounts, ScanSeries, read_quantities
+from app.worker.course import ScanCounts, ScanSeries, TreeHistory, read_quantities
 from app.worker.protocol import (
     LENGTH_BYTES,
     MapChanges,

@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 
 from app.common.text import COMPILING
-from app.explain.history import RecentScans
 from app.worker.loop import WorkerLoop
-from app.worker.outbox import MOST_POINTS, Outbox, picture_of
+from app.worker.outbox import MOST_POINTS, Outbox, RecentScans, picture_of
 from app.worker.protocol import (
     Advance,
     Answer,

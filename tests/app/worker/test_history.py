@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.explain import history as module
-from app.explain.history import RecentScans, TreeHistory, half_axes
+from app.explain.records import half_axes
+from app.worker import course as module
+from app.worker.course import TreeHistory
+from app.worker.outbox import RecentScans
 from tests.app.fakes import PERIOD_NS, START_NS, frame
 
 
@@ -47,7 +49,7 @@ def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch
     history = TreeHistory()
     for index in range(3000):
         history.record(seen(index, float(index), observations=index + 1), START_NS)
-        assert history._count <= 200
+        assert len(history._rows) <= 200
     story = history.of(2, 10**6)
     assert story.x[:10] == [float(k) for k in range(10)]
     assert story.x[-1] > 2500
