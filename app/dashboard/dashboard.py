@@ -31,8 +31,8 @@ from app.dashboard.shown_run import ShownRun
 from app.sources.inspection import check_source
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
-from app.tuning.job import TuneSearch
-from app.tuning.sensitivity import Sensitivity, question_of
+from app.tuning.jobs import RunWithTruth
+from app.tuning.page import Question, Sensitivity, TuneSearch
 from app.worker import protocol
 from pipeline.config import preset
 from pipeline.config.model import Value
@@ -308,8 +308,12 @@ class Dashboard:
             StemmapError: The run cannot be scored, or name or number of values are invalid; the message has
                 the reason.
         """
-        state = self.parameters.parameters
-        self.sensitivity.ask(question_of(self.source, self.digest, self.file_truth, state, name, values))
+        run, parameters = self.run_with_truth(), self.parameters.parameters
+        self.sensitivity.ask(Question(run, parameters, name, tuple(values)))
+
+    def run_with_truth(self) -> RunWithTruth:
+        """Return the open run for a search or a sensitivity curve, see `RunWithTruth.shown` for errors."""
+        return RunWithTruth.shown(self.source, self.digest, self.file_truth)
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree in all views by its number; None clears the selection."""

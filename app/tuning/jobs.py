@@ -46,6 +46,29 @@ class RunWithTruth(msgspec.Struct, frozen=True):
     digest: str
     truth: list[Content]
 
+    @classmethod
+    def shown(cls, source: SourceRequest, digest: str, truth: TruthTrees | None) -> RunWithTruth:
+        """Return the open run, after a check that it can be mapped again and scored.
+
+        Args:
+            source, digest: The open run; the digest is empty if none is open.
+            truth: True trees of the run, with the annotations; None if none are known.
+
+        Raises:
+            StemmapError: No run is open, it is live, or its truth has no tree.
+        """
+        if not digest:
+            raise StemmapError("no run is open", remedy="Open one")
+        if is_live(source.uri):
+            raise StemmapError(
+                "a live run cannot be mapped again", where=source.uri, remedy="Open its recording"
+            )
+        if truth is None or "tree" not in truth.kind:
+            raise StemmapError(
+                "no true trees are known of this run", remedy="Annotate some in the tab Annotate"
+            )
+        return cls(source.request(), digest, contents_of(truth))
+
 
 class Job(msgspec.Struct, frozen=True):
     """A run with one parameter set.
@@ -104,27 +127,6 @@ def code_digest() -> str:
         if file.suffix in (".py", ".json"):
             state.update(f"{file.relative_to(folder).as_posix()}\0".encode() + file.read_bytes() + b"\0")
     return f"{version()}+{state.hexdigest()[:16]}"
-
-
-def check_run(digest: str, uri: str, truth: TruthTrees | None) -> list[Content]:
-    """Return the true trees and other objects of the open run, after a check that it can be mapped again and
-    scored.
-
-    Args:
-        digest: Digest of the run; empty if none is open.
-        uri: URI of the source.
-        truth: True trees of the run, with the annotations; None if none are known.
-
-    Raises:
-        StemmapError: No run is open, it is live, or its truth has no tree.
-    """
-    if not digest:
-        raise StemmapError("no run is open", remedy="Open one")
-    if is_live(uri):
-        raise StemmapError("a live run cannot be mapped again", where=uri, remedy="Open its recording")
-    if truth is None or "tree" not in truth.kind:
-        raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
-    return contents_of(truth)
 
 
 COMMAND = python_module("app.tuning.scoring")

@@ -11,9 +11,8 @@ from starlette.responses import Response
 
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
-from app.tuning.job import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
+from app.tuning.page import MOST_OTHERS, MOST_VALUES, OtherRun, SearchRequest, other_runs, plan_of
 from app.tuning.plan import GOALS, SENSIBLE, Plan
-from app.tuning.sensitivity import MOST_VALUES
 from app.web.responses import Body, SaveSet, Value, Word, json_reply
 from app.web.routes.access import AnyFile, Dash, Deployment, Trainer, permitted_uri
 from pipeline.errors import StemmapError
@@ -148,7 +147,7 @@ async def use_learned(learning: Trainer, dashboard: Dash) -> Response:
 
 
 async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted: SearchRequest) -> Plan:
-    """Return the plan of a search; errors as in `app.tuning.job.plan_of`.
+    """Return the plan of a search; errors as in `plan_of` and `Dashboard.run_with_truth`.
 
     Args:
         dashboard: The open run and the parameters in force.
@@ -157,9 +156,8 @@ async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted
         wanted: The request.
     """
     others = await _others(dashboard, settings, any_file) if wanted.also or wanted.held_out else []
-    state = dashboard.parameters
-    source, digest, truth = dashboard.source, dashboard.digest, dashboard.file_truth
-    return plan_of(wanted, source, digest, truth, state.parameters, state.preset, others, dashboard.results)
+    state, run = dashboard.parameters, dashboard.run_with_truth()
+    return plan_of(wanted, run, state.parameters, state.preset, others, dashboard.results)
 
 
 async def _others(dashboard: Dashboard, settings: Settings, any_file: bool) -> list[OtherRun]:

@@ -16,7 +16,8 @@ import pytest_asyncio
 
 from app.sources.request import SourceRequest
 from app.store.records import Content
-from app.tuning.sensitivity import Question, Sensitivity, question_of
+from app.tuning.jobs import RunWithTruth
+from app.tuning.page import Question, Sensitivity
 from app.web.auth import viewer_token
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
@@ -158,17 +159,16 @@ TRUTH = TruthTrees(np.zeros(1), np.zeros(1), np.full(1, np.nan), ("tree",))
 )
 def test_a_run_that_cannot_be_scored_says_what_to_do(digest, uri, truth, says):
     with pytest.raises(StemmapError, match=says):
-        question_of(SourceRequest(uri), digest, truth, preset("forest"), NAME, [0.1])
+        RunWithTruth.shown(SourceRequest(uri), digest, truth)
 
 
 def test_the_run_that_is_asked_of_is_the_one_that_is_shown():
     source = SourceRequest(
         "sim:stand", "static", 7, {"scan": "/other"}, (0.1, 0.2, 0.9, 0.0, 0.0, math.pi / 2)
     )
-    made = question_of(source, "d", TRUTH, preset("paper"), NAME, [0.1])
-    assert (made.run.source, made.run.digest) == (source, "d")
-    assert msgspec.json.decode(msgspec.json.encode(made.run.truth), type=list[Content]) == made.run.truth
-    assert made.parameters == preset("paper")
+    made = RunWithTruth.shown(source, "d", TRUTH)
+    assert (made.source, made.digest) == (source, "d")
+    assert msgspec.json.decode(msgspec.json.encode(made.truth), type=list[Content]) == made.truth
 
 
 async def test_the_address_takes_a_question_and_refuses_what_cannot_be():

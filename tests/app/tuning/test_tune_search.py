@@ -14,7 +14,7 @@ import pytest
 import pytest_asyncio
 
 from app.sources.request import SourceRequest
-from app.tuning.job import TuneSearch, _why_gone
+from app.tuning.page import TuneSearch, _why_gone
 from app.tuning.plan import Plan, PlannedRun, Trial, axes_of
 from app.tuning.result import Result, SearchMessage
 from app.worker.protocol import Open

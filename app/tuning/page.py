@@ -1,14 +1,18 @@
-"""The parameter search of the page: its process, its state, and what the browsers show of it.
+"""What the page starts: the search for parameters and the sensitivity of the score to one of them, with their
+processes, their state, and what the browsers show of them.
 
 A search maps the open run and other runs of the list in a child process, with the true trees and parameters
 at its start. The search is removed when the run is closed or another search begins; the results of its trials
-are stored, so that a stopped search that begins again makes them at once.
+are stored, so that a stopped search that begins again makes them at once. The points of a sensitivity curve
+are computed one by one, while the run continues.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,13 +27,15 @@ from app.robot.address import is_live
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.records import Content
 from app.store.store import AnnotatedSource
-from app.tuning.jobs import check_run
+from app.tuning.grid import spec_of
+from app.tuning.jobs import COMMAND as SCORING
+from app.tuning.jobs import Job, JobResult, ResultStore, RunWithTruth, ScoringProcesses
 from app.tuning.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
 from app.tuning.result import Result, SearchMessage, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
-from pipeline.errors import SourceError, StemmapError
+from pipeline.config.model import Value
+from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.io.readers import check_existence, path_of
-from pipeline.types.records import TruthTrees
 
 COMMAND = python_module("app.tuning.search")
 State = Literal["none", "looking", "searching", "stopping", "done", "failed"]
@@ -282,9 +288,7 @@ def other_runs(
 
 def plan_of(
     request: SearchRequest,
-    source: SourceRequest,
-    digest: str,
-    truth: TruthTrees | None,
+    shown: RunWithTruth,
     parameters: Parameters,
     preset: str,
     others: Sequence[OtherRun],
@@ -294,23 +298,20 @@ def plan_of(
 
     Args:
         request: The request.
-        source, digest, truth: The open run. The digest is empty if no run is open; the truth is None if no
-            true trees are known.
+        shown: The open run.
         parameters, preset: Those in force.
         others: The other runs of the list.
         kept: Folder of stored results; None keeps them in memory.
 
     Raises:
-        StemmapError: No run is open, it is live or has no true trees; a parameter or its bounds are invalid;
-            or a further run is unknown, named twice or cannot be scored, or there are more than
-            `MOST_OTHERS`.
+        StemmapError: A parameter or its bounds are invalid; or a further run is unknown, named twice or
+            cannot be scored, or there are more than `MOST_OTHERS`.
     """
-    known = check_run(digest, source.uri, truth)
     axes = axes_of(request.over)
     check(axes, parameters)
-    shown = PlannedRun(source.request(), tuple(known), "annotations")
+    source = shown.source
     return Plan(
-        runs=(shown, *_planned(request, others)),
+        runs=(PlannedRun(source, tuple(shown.truth), "annotations"), *_planned(request, others)),
         axes=axes,
         start=parameters.model_dump(),
         kept="" if kept is None else str(kept),
@@ -366,3 +367,163 @@ def _why_gone(uri: str) -> str:
     except SourceError:
         return "its recording does not exist any more"
     return ""
+
+
+# --- sensitivity ------------------------------------------------------------------------------------
+
+POINT_COMMAND = (*SCORING, "--low-priority")
+MOST_VALUES = 65
+IDLE_S = 120.0  # the process and its cache end after this time without a question
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A sensitivity curve to be computed.
+
+    Attributes:
+        run: The run with its true trees.
+        parameters: The parameters in force.
+        name: Dotted name of the parameter.
+        values: Values of the parameter in the order in which they are computed, coarse steps first.
+    """
+
+    run: RunWithTruth
+    parameters: Parameters
+    name: str
+    values: tuple[Value, ...]
+
+
+class Sensitivity:
+    """Computes the newest sensitivity curve, point by point.
+
+    Args:
+        tell: Called with the curve and its points so far after each point (see `_state_of`), and with {} when
+            the curve is removed.
+        command: Program and arguments of the child process.
+        idle_s: Time without a new curve after which the process ends [s].
+        kept: Folder of stored results; None keeps them in memory.
+    """
+
+    def __init__(
+        self,
+        tell: Callable[[dict[str, Any]], None],
+        command: Sequence[str] = POINT_COMMAND,
+        idle_s: float = IDLE_S,
+        kept: Path | None = None,
+    ) -> None:
+        self._tell, self._command, self._idle_s = tell, command, idle_s
+        self._kept = ResultStore(kept)
+        self._question: Question | None = None
+        self._changed = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+
+    def ask(self, question: Question) -> None:
+        """Start a curve, and send it without points. It replaces the one before, whose current point is still
+        completed, because its cache serves both. The caller needs a running event loop.
+
+        Raises:
+            ParameterError: There is no such parameter, or there are no or more than `MOST_VALUES` values.
+        """
+        spec_of(question.name)
+        if not 1 <= len(question.values) <= MOST_VALUES:
+            raise ParameterError(f"{len(question.values)} values are not between 1 and {MOST_VALUES}")
+        self._question = question
+        self._changed.set()
+        self._tell(_state_of(question, []))
+        if self._task is None:
+            self._task = asyncio.create_task(self._work(), name="sensitivity")
+
+    async def leave(self) -> None:
+        """Cancel the curve, wait until the process has ended, and send {}, because the run or the curve is
+        closed. Without a curve only {} is sent."""
+        task, self._task, self._question = self._task, None, None
+        await cancel(task)
+        self._tell({})
+
+    async def _work(self) -> None:
+        """Compute curves until none was requested for `idle_s`; then end the process."""
+        process: ScoringProcesses[None] = ScoringProcesses(1, self._command, self._kept)
+        try:
+            while (question := self._question) is not None:
+                self._changed.clear()
+                await self._compute(question, process)
+                if self._question is question:
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(self._changed.wait(), self._idle_s)
+                    if self._question is question:
+                        break
+        finally:
+            if self._task is asyncio.current_task():
+                self._task = None
+            await asyncio.to_thread(process.close)
+
+    async def _compute(self, question: Question, process: ScoringProcesses[None]) -> None:
+        """Compute the points of a curve until it is complete or replaced, and send it after each point. A
+        StemmapError is sent with the curve and ends it; it is not raised."""
+        points: list[dict[str, Any]] = []
+        try:
+            for value in question.values:
+                points = [*points, await self._point(question, value, process)]
+                if self._question is not question:
+                    return
+                self._tell(_state_of(question, points))
+        except StemmapError as failure:
+            if self._question is question:
+                self._tell(_state_of(question, points, str(failure)))
+
+    async def _point(
+        self, question: Question, value: Value, process: ScoringProcesses[None]
+    ) -> dict[str, Any]:
+        """Return a point of the curve as a dict: `value` with its scores (see `_figures`), or with `error` if
+        the value contradicts other parameters or the job failed.
+
+        Args:
+            question: The curve.
+            value: Value of its parameter.
+            process: Computes the job.
+
+        Raises:
+            StemmapError: The process cannot be started, or ended too often.
+        """
+        try:
+            parameters = question.parameters.replace({question.name: value})
+        except ParameterError as error:  # it contradicts another one
+            return {"value": value, "error": error.what}
+        answer = await asyncio.wrap_future(process.submit(Job(question.run, parameters.model_dump())))
+        return {"value": value, **_figures(answer)}
+
+
+def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
+    """Return a curve as a dict: `name`; `asked_with`, a dict from the dotted names of all parameters in force
+    to their values; `of`, the number of values; `points`; and `error`.
+
+    Args:
+        question: Parameter, its values, and the other parameters.
+        points: Points so far, see `Sensitivity._point`.
+        error: Why the computation ended early; empty if it did not.
+    """
+    return {
+        "name": question.name,
+        "asked_with": question.parameters.flat(),
+        "of": len(question.values),
+        "points": points,
+        "error": error,
+    }
+
+
+def _figures(answer: JobResult) -> dict[str, Any]:
+    """Return the scores of a point as a dict: `f1`, `TA` and `TA_of`, `false` (number of false trees),
+    `position_rmse_m`, `mean_pair_error_percent` and `trees`; only `error` if the job failed or no ground
+    truth is near the path."""
+    s = answer.scores
+    if s is None or answer.problem:
+        return {"error": answer.problem}
+    return {
+        "f1": s.f1,
+        "TA": s.TA.count,
+        "TA_of": s.TA.of,
+        "false": s.FA.count + s.spurious,
+        "position_rmse_m": s.position_rmse,
+        "mean_pair_error_percent": s.mean_pair_error_percent,
+        "trees": answer.trees,
+    }
