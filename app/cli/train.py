@@ -14,7 +14,7 @@ from pipeline.errors import StemmapError, UsageError
 
 if TYPE_CHECKING:
     from app.store.store import Store
-    from app.training.annotated_runs import AnnotatedRun
+    from app.training.examples import AnnotatedRun
 
 HELP = "extend the random forest that classifies trees with annotations"
 
@@ -98,7 +98,7 @@ def _chosen(store: Store, names: list[str]) -> list[AnnotatedRun]:
         UsageError: A name is unknown.
         StemmapError: There are no annotations at all.
     """
-    from app.training.annotated_runs import annotated_run
+    from app.training.examples import annotated_run
 
     sources = store.annotated_sources()
     known = {word: source for source in sources for word in (source.source, source.request.uri, source.name)}

@@ -24,8 +24,15 @@ from app.common.text import count, version
 from app.store.forests import LEAST_OTHERS, LEAST_TREES, Forests
 from app.store.records import moment
 from app.store.store import AnnotatedSource
-from app.training.annotated_runs import AnnotatedRun, Progress, annotated_run, examples_of
-from app.training.examples import TREE, Examples, object_numbers
+from app.training.examples import (
+    TREE,
+    AnnotatedRun,
+    Examples,
+    Progress,
+    annotated_run,
+    examples_of,
+    object_numbers,
+)
 from app.training.fit_forest import all_expanded
 from pipeline.classification.column_classifier import too_few as too_few_voxels
 from pipeline.classification.forest import (

@@ -24,7 +24,7 @@ from app.sources.request import SourceRequest, request_of_kept
 from app.store.database import maps
 from app.store.records import Author, Content
 from app.store.store import Store
-from app.training.annotated_runs import annotated_run
+from app.training.examples import annotated_run
 from app.worker.protocol import Begin, Open, Shown, View
 from pipeline.errors import SourceError, StemmapError
 from pipeline.types.records import TruthTrees

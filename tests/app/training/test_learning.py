@@ -17,8 +17,7 @@ from app.dashboard.parameters import ParameterState
 from app.store.forests import FOLDER, LEAST_OTHERS, LEAST_TREES, PACKAGE, Forests, name_of
 from app.store.records import Author, Content
 from app.store.store import Store
-from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector
-from app.training.examples import TREE, Examples, object_numbers
+from app.training.examples import CLASS_OF_KIND, SEEN, TREE, ExampleCollector, Examples, object_numbers
 from app.training.fit_forest import PRIOR, SETTINGS, all_expanded, expanded
 from app.training.learning import SAME_PLACE, Rates, fold_of, groups_of, seen_by, validate, what_lacks
 from pipeline.classification import no_columns
