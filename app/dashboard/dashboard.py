@@ -23,8 +23,7 @@ from app.dashboard.camera_view import CameraView
 from app.dashboard.events import Events
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
-from app.dashboard.reviewed_runs import ReviewedRuns
-from app.dashboard.run_recorder import RunRecorder, RunState
+from app.dashboard.run_recorder import ReviewedRuns, RunRecorder, RunState
 from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
 from app.dashboard.shown_run import ShownRun
