@@ -23,10 +23,10 @@ from app.dashboard.camera_view import CameraView
 from app.dashboard.events import Events
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
-from app.dashboard.run_recorder import ReviewedRuns, RunRecorder, RunState
+from app.dashboard.run_recorder import ReviewedRuns, RunRecorder
 from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
-from app.dashboard.shown_run import ShownRun
+from app.dashboard.shown_run import ShownRun, truth_in_file
 from app.sources.inspection import check_source
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
@@ -123,13 +123,6 @@ class Dashboard:
         run of scans [m]."""
         cloud = self.status.cloud
         return (0.0, 0.0) if cloud is None else cloud.offset[:2]
-
-    @property
-    def file_truth(self) -> TruthTrees | None:
-        """Ground truth with annotations in the coordinates of the file, see `offset`; None where none is
-        known."""
-        (x, y), truth = self.offset, self.truth
-        return None if truth is None else replace(truth, x=truth.x + x, y=truth.y + y)
 
     async def start(self, source: protocol.Open, make_scene: Callable[[], Scene]) -> None:
         """Start the worker, which opens a source while the scene is made, and load the saved parameter sets.
@@ -312,7 +305,7 @@ class Dashboard:
 
     def run_with_truth(self) -> RunWithTruth:
         """Return the open run for a search or a sensitivity curve, see `RunWithTruth.shown` for errors."""
-        return RunWithTruth.shown(self.source, self.digest, self.file_truth)
+        return RunWithTruth.shown(self.source, self.digest, truth_in_file(self.truth, self.status.cloud))
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree in all views by its number; None clears the selection."""
@@ -498,23 +491,10 @@ class Dashboard:
         self._show_map(payload, path_rows, counted)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
             self._broadcast_events()
-        self.run_recorder.shown(self._run_state(shown))
+        self.run_recorder.shown(ShownRun.of(self), self.scores.latest)
         self._score()
         self._show_scene(shown.frame, path_rows)
         await self.loop.shown(shown.time_s, self.status)
-
-    def _run_state(self, shown: protocol.Shown) -> RunState:
-        """Return the state of the run for its record."""
-        state = self.parameters
-        return RunState(
-            shown,
-            self.path_xy,
-            state.preset,
-            state.parameters.flat(),
-            self.truth,
-            self.scores.latest,
-            ShownRun.of(self).texts,
-        )
 
     def _broadcast_score(self, score: dict[str, Any] | None) -> None:
         """Broadcast a score (None if there is no map) and record it."""

@@ -9,7 +9,7 @@ import io
 import logging
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -20,15 +20,15 @@ from numpy.typing import NDArray
 from app.batch.reviews import reviews_of
 from app.batch.summary import lost_share
 from app.dashboard.payload import trees_payload, truth_payload
+from app.dashboard.shown_run import ShownRun
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.store.records import Change, Content, NewRun, RunFigures
 from app.store.store import Store
-from app.worker.protocol import Opened, Shown
+from app.worker.protocol import Opened
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
 from pipeline.io.result_files import OPEN, REJECTED
-from pipeline.types.records import TruthTrees
 
 Float = NDArray[np.float64]
 
@@ -39,28 +39,6 @@ _PAUSE_S = 5.0
 MOST_PATH_POINTS = 3000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RunState:
-    """State of a run at one moment; it is not modified afterwards.
-
-    Attributes:
-        shown: Displayed frame.
-        path_xy: Path, shape (N, 2) [m].
-        preset, parameters: Current preset and parameters.
-        truth, scores: Ground truth and scores at that moment.
-        files: Returns a dict from the names of the result files to their texts, see `ShownRun.texts`; takes
-            up to seconds.
-    """
-
-    shown: Shown
-    path_xy: Float
-    preset: str
-    parameters: dict[str, Value]
-    truth: TruthTrees | None
-    scores: dict[str, Any] | None
-    files: Callable[[], dict[str, str]]
-
-
 @dataclass(slots=True, eq=False)
 class _Page:
     """Record of one run.
@@ -69,6 +47,7 @@ class _Page:
         beginning, all_scans: The opened run, and the number of its scans; None if unknown.
         record: Number of the record; None before it is written.
         best: State at the farthest scan that was reached; newest: state that was shown last.
+        scores: Scores of `best`; None if there are none.
         dirty: Whether `best` is not written.
         changes: Changes of parameters that are not written.
         writer: Task that writes the record.
@@ -78,8 +57,9 @@ class _Page:
     beginning: NewRun
     all_scans: int | None
     record: int | None = None
-    best: RunState | None = None
-    newest: RunState | None = None
+    best: ShownRun | None = None
+    newest: ShownRun | None = None
+    scores: dict[str, Any] | None = None
     dirty: bool = False
     changes: list[Change] = field(default_factory=list)
     writer: asyncio.Task[None] | None = None
@@ -132,15 +112,15 @@ class RunRecorder:
             page.ended.set()
             self._soon(page)
 
-    def shown(self, state: RunState) -> None:
-        """Record a shown scan. The scan with the largest index counts, so that stepping back keeps the map;
-        of results of the same scan, the last. Nothing without a record."""
+    def shown(self, state: ShownRun, scores: dict[str, Any] | None) -> None:
+        """Record a shown scan with the newest scores. The scan with the largest index counts, so that
+        stepping back keeps the map; of results of the same scan, the last. Nothing without a record."""
         page = self._page
         if page is None:
             return
         page.newest = state
         if page.best is None or state.shown.frame.index >= page.best.shown.frame.index:
-            page.best, page.dirty = state, True
+            page.best, page.scores, page.dirty = state, scores, True
             self._soon(page)
 
     def scored(self, scores: dict[str, Any] | None) -> None:
@@ -149,8 +129,7 @@ class RunRecorder:
         page = self._page
         if page is None or page.best is None or page.best is not page.newest or scores is None:
             return
-        page.best = page.newest = replace(page.best, scores=scores)
-        page.dirty = True
+        page.scores, page.dirty = scores, True
         self._soon(page)
 
     def changed(
@@ -211,14 +190,14 @@ class RunRecorder:
     async def _write(self, page: _Page) -> None:
         """Write the best state of a record and the changes of parameters if they are not written, creating
         the record if necessary; raises StemmapError if the store refuses, then they stay pending."""
-        state, changes = page.best, page.changes
+        state, scores, changes = page.best, page.scores, page.changes
         if state is None or not (page.dirty or changes):
             page.dirty, page.changes = False, []
             return
         page.dirty, page.changes = False, []
 
         def work(store: Store) -> None:
-            figures = _figures_of(state, page.all_scans)
+            figures = _figures_of(state, scores, page.all_scans)
             if page.record is None:
                 page.record = store.book.begin(page.beginning, figures)
             else:
@@ -237,7 +216,7 @@ class RunRecorder:
         store refuses."""
         state, record = page.best, page.record
         if state is not None and record is not None:
-            files = zip_of(await asyncio.to_thread(state.files))
+            files = zip_of(await asyncio.to_thread(state.texts))
             await self._ask(lambda store: store.book.put_files(record, files))
 
     async def _ask(self, work: Callable[[Store], None]) -> None:
@@ -265,31 +244,30 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
     return content.getvalue()
 
 
-def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
+def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None) -> RunFigures:
     """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
     (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth).
 
     Args:
-        state: The state.
+        state, scores: The state, and its scores; None if there are none.
         all_scans: Number of scans of the source; None if unknown.
     """
     shown = state.shown
-    frame = shown.frame
-    trees = trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))
+    trees = trees_payload(shown.frame.trees, start_ns=state.start_ns)
     truth = truth_payload(state.truth)
     return RunFigures(
-        scans=frame.index + 1,
+        scans=shown.frame.index + 1,
         all_scans=all_scans,
         time_s=round(shown.time_s, 3),
-        distance_m=round(float(np.hypot(*np.diff(state.path_xy, axis=0).T).sum()), 3),
+        distance_m=state.distance_m,
         lost=None if shown.counts is None else lost_share(shown.counts.health),
         trees=len(trees),
         preset=state.preset,
-        parameters=state.parameters,
-        scores=state.scores,
+        parameters=state.parameters.flat(),
+        scores=scores,
         map={
             "trees": trees,
-            "path": thinned(state.path_xy),
+            "path": thinned(np.column_stack([state.path.x, state.path.y])),
             "truth": None if truth is None else truth["trees"],
         },
     )

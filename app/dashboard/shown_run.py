@@ -56,7 +56,7 @@ class ShownRun:
         path: The estimated path.
         start_ns: Time of the first scan [ns].
         preset, parameters: In force.
-        truth: Ground truth in the coordinates of the files; None if there is none.
+        truth: Ground truth in the frame of the map; None if there is none.
         seen: Views of the observed area; those of later scans may be added.
         edits: The annotations of trees, also skipped ones, and the plots.
         frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
@@ -91,11 +91,16 @@ class ShownRun:
             dashboard.start_ns,
             state.preset,
             state.parameters,
-            dashboard.file_truth,
+            dashboard.truth,
             dashboard.seen,
             (*editor.rows, *editor.skipped, *editor.plots),
             editor.frame,
         )
+
+    @property
+    def distance_m(self) -> float:
+        """Length of the path [m], rounded to 1 mm."""
+        return round(float(np.hypot(np.diff(self.path.x), np.diff(self.path.y)).sum()), 3)
 
     @property
     def cloud(self) -> CloudFrame | None:
@@ -166,7 +171,7 @@ class ShownRun:
         where known; `seed`, `odometry`, `preset`, `changed` and `parameters`; `scans` (0 for a whole cloud),
         `duration_s` and `distance_m`; `trees`, without the rejected ones, and `rejected`, their number;
         `evaluation`, which reviews do not change, None without ground truth; and those of `_counts`."""
-        status, truth = self.status, self.truth
+        status, truth = self.status, truth_in_file(self.truth, self.cloud)
         trees = in_file(self.shown.frame.trees, self.cloud)
         rejected = sum(review == REJECTED for review in self.reviews().values())
         scores = None
@@ -188,7 +193,7 @@ class ShownRun:
             "parameters": self.parameters.model_dump(),
             "scans": 0 if self.cloud else self.shown.frame.index + 1,
             "duration_s": round(self.shown.time_s, 6),
-            "distance_m": round(float(np.hypot(np.diff(self.path.x), np.diff(self.path.y)).sum()), 3),
+            "distance_m": self.distance_m,
             "trees": int(np.count_nonzero(trees.confirmed)) - rejected,
             "rejected": rejected,
             "evaluation": scores,
@@ -225,3 +230,11 @@ def in_file(trees: Trees, cloud: CloudFrame | None) -> Trees:
     """Return a copy of trees in the coordinates of the file of a whole cloud; for a run of scans (None) the
     trees themselves."""
     return trees if cloud is None else replace(trees, position=trees.position + cloud.offset[:2])
+
+
+def truth_in_file(truth: TruthTrees | None, cloud: CloudFrame | None) -> TruthTrees | None:
+    """Return ground truth in the coordinates of the file of a whole cloud; None for None. For a run of scans
+    (no cloud) it is the ground truth itself."""
+    if truth is None or cloud is None:
+        return truth
+    return replace(truth, x=truth.x + cloud.offset[0], y=truth.y + cloud.offset[1])

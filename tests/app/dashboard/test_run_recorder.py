@@ -40,7 +40,7 @@ def recorder_of(store: RefusingStore) -> RunRecorder:
     """A recorder of an open run that has a record and has shown a scan."""
     recorder = RunRecorder(cast(Any, store))
     page = run_recorder._Page(cast(Any, None), None, record=1)
-    page.best = page.newest = cast(Any, SimpleNamespace(shown=SimpleNamespace(time_s=2.0), files=dict))
+    page.best = page.newest = cast(Any, SimpleNamespace(shown=SimpleNamespace(time_s=2.0), texts=dict))
     recorder._page = page
     return recorder
 
