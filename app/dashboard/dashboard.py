@@ -63,6 +63,7 @@ class Dashboard:
         truth: Ground truth with annotations; None where none is known.
         seen: Views of the observed area.
         results: Folder of stored results of sensitivity curves and searches; None if there is no data folder.
+        run: Number of the open run at the worker; None before it is open.
         source, digest: Requested source, and digest (or URI) of the open run, "" before it is open.
     """
 
@@ -89,21 +90,15 @@ class Dashboard:
         self.seen = SeenRecorder()
         self.sets = ParameterSets(self.store, self._show_parameters)
         self._before_after = BeforeAfter()
-        self.worker_client = WorkerClient(lambda question: self.worker.send(question), lambda: self._run)
+        self.worker_client = WorkerClient(lambda question: self.worker.send(question), lambda: self.run)
         self.camera = CameraView(self.worker_client)
-        self.selector = Selector(
-            self.worker_client,
-            live,
-            lambda tree, ring: self.scene.select(tree, ring),
-            run=lambda: self._run,
-            newest=lambda: None if self.shown is None else self.shown.frame.index,
-        )
+        self.selector = Selector(self)
         self.source = SourceRequest("")
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.search = TuneSearch(lambda state: live.publish("search", state))
         self.loop = LoopPlayback(self)
-        self._run: int | None = None
+        self.run: int | None = None
         self._notice = ""
         self._restarts = 0
         self._opens = self._requests = 0
@@ -202,7 +197,7 @@ class Dashboard:
         """
         self._requests += 1
         asked = self._requests
-        if self._run is not None:
+        if self.run is not None:
             await self.check_source(request)
             if asked != self._requests:
                 return
@@ -222,7 +217,7 @@ class Dashboard:
         """Close the run: end its record, searches and analyses, and remove it from the page. From now on,
         `source` is the source that is expected to open. The worker gets no command."""
         self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
-        self._run, self.source, self.digest = None, source, ""
+        self.run, self.source, self.digest = None, source, ""
         self.live.publish("source", source.for_page())
         self.camera.forget()
         self.run_recorder.leave()
@@ -358,13 +353,13 @@ class Dashboard:
                 await self._begin(message)
             case protocol.Shown():
                 await self._show(message)
-            case protocol.View(run=run, stamp_ns=stamp_ns, free=free) if run == self._run:
+            case protocol.View(run=run, stamp_ns=stamp_ns, free=free) if run == self.run:
                 self.seen.add(stamp_ns, free)
             case protocol.Answer():
                 self.worker_client.take(message)
-            case protocol.Remapped(run=run, changes=changes) if run == self._run:
+            case protocol.Remapped(run=run, changes=changes) if run == self.run:
                 self._remapped(changes)
-            case protocol.Rough(run=run, revision=revision, trees=trees) if run == self._run:
+            case protocol.Rough(run=run, revision=revision, trees=trees) if run == self.run:
                 # A preview is only roughly right, so it has no score.
                 self.live.publish(
                     "rough", {"revision": revision, "places": np.round(trees.position, 3).tolist()}
@@ -384,7 +379,7 @@ class Dashboard:
         """Load the annotations of an opened source, begin its record, use the preset that suits it, and send
         the worker the parameters; then it plays, except after a restart of the worker, unless `Play` or
         `Open` was requested meanwhile. Nothing is sent if another source was requested."""
-        self._run, self.digest = opened.run, opened.digest or opened.uri
+        self.run, self.digest = opened.run, opened.digest or opened.uri
         number = self._opens
         await self.annotation_editor.begin(opened.digest or opened.uri, opened.uri, opened.truth)
         if number != self._opens:  # another source was requested meanwhile
@@ -465,7 +460,7 @@ class Dashboard:
         """Take over the results of a scan: extend the path, broadcast map and events, record, score and draw
         it. A frame without ground has that of the frame before. Results of a run that was left are
         ignored."""
-        if shown.run != self._run:  # of a run that was left
+        if shown.run != self.run:  # of a run that was left
             return
         number = self._opens
         if self.shown is None:

@@ -7,9 +7,8 @@ import asyncio
 import itertools
 from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
-from app.dashboard.broadcast import Broadcast
 from app.explain.records import ClusterStory, MapSection, TreeStory
 from app.worker.protocol import (
     Answer,
@@ -28,6 +27,9 @@ from app.worker.protocol import (
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame
+
+if TYPE_CHECKING:
+    from app.dashboard.dashboard import Dashboard
 
 PATIENCE_S = 15.0
 _MOST_WAITING = 100
@@ -190,33 +192,16 @@ class Selection:
         return {"tree": self.tree, "cluster": cluster}
 
 
-Ring = tuple[float, float, float] | None
-Place = tuple[float, float, float]
-
-
 class Selector:
     """The selected tree or cluster, and its changes.
 
     Args:
-        worker_client: Requests the explanations.
-        live: Broadcast to the browsers.
-        mark: Highlights a tree and a ring in the scene, and returns x, y and height of the ground there [m].
-        run: Returns the number of the present run, None if there is none.
-        newest: Returns the index of the newest shown scan, None if there is none.
+        dashboard: State of the run, with its scene and its worker.
     """
 
-    def __init__(
-        self,
-        worker_client: WorkerClient,
-        live: Broadcast,
-        mark: Callable[[int | None, Ring], Place | None],
-        *,
-        run: Callable[[], int | None],
-        newest: Callable[[], int | None],
-    ) -> None:
+    def __init__(self, dashboard: Dashboard) -> None:
         self.selection = Selection()
-        self._client, self._live, self._mark = worker_client, live, mark
-        self._run, self._newest = run, newest
+        self._dashboard = dashboard
         self._task: asyncio.Task[None] | None = None
 
     def tree(self, number: int | None) -> None:
@@ -233,9 +218,9 @@ class Selector:
             NoStoryError: The cluster is no longer available, or no run is shown.
             WorkerBusyError: The worker did not answer in time.
         """
-        run = self._run()
+        run = self._dashboard.run
         story = await self.story(scan, cluster)
-        if run == self._run():  # else it was left meanwhile
+        if run == self._dashboard.run:  # else it was left meanwhile
             self._select(Selection(story.tree, story))
 
     def cluster_soon(self, scan: int, cluster: int) -> None:
@@ -264,7 +249,9 @@ class Selector:
         kept = self.selection.cluster
         if kept is not None and (kept.scan, kept.cluster) == (scan, cluster):
             return kept
-        return await self._client.cluster(self._newest() if scan is None else scan, cluster)
+        shown = self._dashboard.shown
+        newest = None if shown is None else shown.frame.index
+        return await self._dashboard.worker_client.cluster(newest if scan is None else scan, cluster)
 
     def remove(self, trees: Collection[int]) -> None:
         """Clear the selection of a tree that does not exist any more. A selected cluster stays.
@@ -286,12 +273,12 @@ class Selector:
         try:
             await self.cluster(scan, cluster)
         except StemmapError as error:
-            self._live.publish("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
+            self._dashboard.live.publish("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
 
     def _select(self, selection: Selection) -> None:
         """Set the selection, highlight it in the scene, broadcast it with its `place`, and clear the message
         "missing"."""
         self.selection = selection
-        place = self._mark(selection.tree, selection.ring)
-        self._live.publish("selection", {**selection.as_plain(), "place": place})
-        self._live.publish("missing", None)
+        place = self._dashboard.scene.select(selection.tree, selection.ring)
+        self._dashboard.live.publish("selection", {**selection.as_plain(), "place": place})
+        self._dashboard.live.publish("missing", None)
