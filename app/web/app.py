@@ -16,7 +16,7 @@ from starlette.middleware import Middleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.common.settings import BODY_LIMIT, Settings
+from app.common.settings import Settings
 from app.common.timers import TooManyRequestsError
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
@@ -136,15 +136,7 @@ def guarded(settings: Settings, *, port: int, tokens: AccessTokens, lifespan: Li
         tokens: Tokens of the links.
         lifespan: Context in which the application runs.
     """
-    guard = Middleware(
-        Guard,
-        tokens=tokens,
-        host=settings.host,
-        port=port,
-        further_hosts=settings.hosts,
-        body_limit=BODY_LIMIT,
-        upload_limit=settings.upload_limit,
-    )
+    guard = Middleware(Guard, tokens=tokens, settings=settings, port=port)
     app = FastAPI(
         title="stemmap",
         lifespan=lifespan,

@@ -29,7 +29,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.common.settings import Settings, is_loopback
+from app.common.settings import BODY_LIMIT, Settings, is_loopback
 from app.common.user import current_user, user_of_cookies
 from app.web.responses import error_reply
 from pipeline.errors import StemmapError
@@ -272,30 +272,19 @@ class Guard:
     Args:
         app: The guarded application.
         tokens: Tokens of the owner and of viewers.
-        host, port: Address on which the server listens.
-        further_hosts: Further accepted host names.
-        body_limit: Maximum size of the body of a request [bytes].
-        upload_limit: Maximum size of the body of an upload [bytes].
+        settings: Settings with the host on which the server listens, further accepted names of it, and the
+            largest size of an upload.
+        port: Port on which the server listens.
     """
 
-    def __init__(
-        self,
-        app: ASGIApp,
-        *,
-        tokens: AccessTokens,
-        host: str,
-        port: int,
-        further_hosts: Iterable[str] = (),
-        body_limit: int,
-        upload_limit: int = 0,
-    ) -> None:
+    def __init__(self, app: ASGIApp, *, tokens: AccessTokens, settings: Settings, port: int) -> None:
         self._app = app
         self._tokens = tokens
         self._used_tickets: dict[str, int] = {}  # with the time at which they expire
         self._port = port
-        self._hosts = allowed_hosts(host, port, further_hosts)
-        self._any_address = host in _ANY_ADDRESS
-        self._body_limit, self._upload_limit = body_limit, upload_limit
+        self._hosts = allowed_hosts(settings.host, port, settings.hosts)
+        self._any_address = settings.host in _ANY_ADDRESS
+        self._upload_limit = settings.upload_limit
         self.cookie = f"stemmap_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -405,10 +394,10 @@ class Guard:
         )
 
     def _limit_of(self, scope: Scope) -> int:
-        """Return the maximum size of the body of a request [bytes]: `body_limit`, or for an upload of a
-        recording the maximum of `body_limit` and `upload_limit`."""
+        """Return the maximum size of the body of a request [bytes]: BODY_LIMIT, or for an upload of a
+        recording the maximum of it and the limit in the settings."""
         is_upload = scope.get("path") == UPLOADS and scope.get("method") == "POST"
-        return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
+        return max(BODY_LIMIT, self._upload_limit) if is_upload else BODY_LIMIT
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
         """Return the response to a link with a valid token or ticket (see `_welcome`), 401 for a request

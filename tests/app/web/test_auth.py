@@ -401,7 +401,8 @@ async def test_what_the_page_does_not_say_ends_the_connection() -> None:
 
 
 def test_an_open_address_is_called_by_number_or_own_name_only() -> None:
-    guard = Guard(build_app(), tokens=AccessTokens(TOKEN), host="0.0.0.0", port=PORT, body_limit=10)  # noqa: S104
+    settings = Settings(host="0.0.0.0")  # noqa: S104
+    guard = Guard(build_app(), tokens=AccessTokens(TOKEN), settings=settings, port=PORT)
     assert guard._is_own_address(f"192.168.1.4:{PORT}")
     assert not guard._is_own_address(f"rebound.example:{PORT}")
     assert not guard._is_own_address(f"192.168.1.4:{PORT + 1}")
@@ -442,7 +443,7 @@ async def test_who_comes_from_elsewhere_is_led_on_by_a_page_of_our_own(client: h
     ],
 )
 async def test_a_host_that_resembles_ours_is_refused(client: httpx.AsyncClient, host: str) -> None:
-    guard = Guard(refusing_app, tokens=AccessTokens(TOKEN), host="127.0.0.1", port=PORT, body_limit=1000)
+    guard = Guard(refusing_app, tokens=AccessTokens(TOKEN), settings=Settings(), port=PORT)
     assert not guard._knows_host(Headers({"host": host}))
 
 
