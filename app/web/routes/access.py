@@ -96,14 +96,14 @@ def _role(connection: HTTPConnection) -> Role:
     return role_of(connection.scope)
 
 
-def _may_open_any_file(connection: HTTPConnection) -> bool:
-    """Return whether the request may name any file of this machine; otherwise only recordings in the data
-    folders. It may as an owner, if the settings allow any file, or allow it locally and the request is local.
-    """
+def _permission(connection: HTTPConnection) -> Permission:
+    """Return the permission of a request. It may name any file of this machine as an owner, if the settings
+    allow any file, or allow it locally and the request is local; otherwise only recordings in the data
+    folders."""
     settings: Settings = connection.app.state.settings
-    if role_of(connection.scope) != "owner" or settings.files == "folders":
-        return False
-    return settings.files == "any" or (settings.loopback and is_local(connection.headers))
+    is_local_request = not settings.files and settings.loopback and is_local(connection.headers)
+    any_file = role_of(connection.scope) == "owner" and (settings.files == "any" or is_local_request)
+    return lambda uri: permitted_uri(uri, settings, any_file)
 
 
 async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
@@ -143,7 +143,9 @@ async def in_thread(context: AbstractContextManager[T]) -> AsyncIterator[T]:
 
 FigureParameters = Annotated[Stand, Depends(_figure_parameters)]
 CallerRole = Annotated[Role, Depends(_role)]
-AnyFile = Annotated[bool, Depends(_may_open_any_file)]
+#: Returns the source that the request may open for a URI, or None, see `permitted_uri`.
+Permission = Callable[[str], str | None]
+Permitted = Annotated[Permission, Depends(_permission)]
 #: For routes that cost the mapping process or this one more than some milliseconds.
 ViewerTurn = Depends(_viewer_turn, scope="function")
 
@@ -158,35 +160,32 @@ class NotPermittedError(StemmapError):
     """The request names a file that its sender may not open."""
 
 
-def not_permitted(uri: str) -> NotPermittedError:
-    """Return the error for a source that the request may not open."""
-    return NotPermittedError(
-        "only scenarios and the recordings of the data folder can be opened here",
-        where=uri,
-        remedy="Put it into the folder of recordings, or start stemmap with STEMMAP_FILES=any",
-    )
+def checked_uri(uri: str, permitted: Permission) -> str:
+    """Return the source that the request may open for a URI; NotPermittedError if it may not be opened."""
+    allowed = permitted(uri)
+    if allowed is None:
+        raise NotPermittedError(
+            "only scenarios and the recordings of the data folder can be opened here",
+            where=uri,
+            remedy="Put it into the folder of recordings, or start stemmap with STEMMAP_FILES=any",
+        )
+    return allowed
 
 
-def permitted_request(request: SourceRequest, settings: Settings, any_file: bool) -> SourceRequest:
+def permitted_request(request: SourceRequest, permitted: Permission) -> SourceRequest:
     """Return the request with paths that may be opened.
 
     Args:
         request: The request of the browser.
-        settings: Settings of the deployment.
-        any_file: See `permitted_uri`.
+        permitted: Permission of the sender.
 
     Raises:
         NotPermittedError: A file may not be opened.
         BadRequestError: The odometry is unknown.
     """
-    uri, odometry = permitted_uri(request.uri, settings, any_file), request.odometry
-    if uri is None:
-        raise not_permitted(request.uri)
+    uri, odometry = checked_uri(request.uri, permitted), request.odometry
     if odometry.startswith(FILE):
-        poses = permitted_uri(odometry.removeprefix(FILE), settings, any_file)
-        if poses is None:
-            raise not_permitted(odometry)
-        odometry = f"{FILE}{poses}"
+        odometry = f"{FILE}{checked_uri(odometry.removeprefix(FILE), permitted)}"
     elif odometry not in _ODOMETRY:
         raise BadRequestError(
             f"the odometry {odometry[:40]!r} is unknown",

@@ -17,7 +17,7 @@ from starlette.responses import Response
 from app.sources.inspection import ask
 from app.sources.request import LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
 from app.web.responses import BadRequestError, Body, Value, Word, json_reply
-from app.web.routes.access import AnyFile, Dash, Deployment, not_permitted, permitted_request, permitted_uri
+from app.web.routes.access import Dash, Deployment, Permitted, checked_uri, permitted_request
 from app.worker.protocol import FASTEST, LONGEST_S, MOST_SCANS, Command
 from pipeline.errors import StemmapError
 
@@ -128,27 +128,22 @@ async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
 
 
 @router.post("/open")
-async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+async def open_source(body: _Source, dashboard: Dash, permitted: Permitted) -> Response:
     """POST /api/open: close the run and open another source, with its parameters if any are given. The
     response is empty (202); the status reports the result. 403 for a file that the caller may not open, 422
     for an unknown odometry or invalid parameters, 409 if the source cannot be opened; the open run is kept
     then."""
-    request = permitted_request(
-        SourceRequest(**{**body.model_dump(), "mount": mount_of_degrees(body.mount)}), settings, any_file
-    )
-    await dashboard.open(request)
+    request = SourceRequest(**{**body.model_dump(), "mount": mount_of_degrees(body.mount)})
+    await dashboard.open(permitted_request(request, permitted))
     return json_reply({}, 202)
 
 
 @router.post("/inside")
-async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) -> Response:
+async def inside(body: _Uninspected, permitted: Permitted) -> Response:
     """POST /api/inside: return the topics of a recording or a robot and the mounting of its LiDAR, read by a
     child process (see `app.sources.inspection_process.inside`); 403 if the address is not permitted on this
     server, 409 if it cannot be read."""
-    uri = permitted_uri(body.uri, settings, any_file)
-    if uri is None:
-        raise not_permitted(body.uri)
-    return json_reply(await ask({"ask": "inside", "path": uri}))
+    return json_reply(await ask({"ask": "inside", "path": checked_uri(body.uri, permitted)}))
 
 
 @router.get("/sources")

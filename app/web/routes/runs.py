@@ -40,10 +40,10 @@ from app.web.responses import (
     json_reply,
 )
 from app.web.routes.access import (
-    AnyFile,
     Dash,
     Deployment,
     FigureParameters,
+    Permitted,
     ViewerTurn,
     in_thread,
     permitted_request,
@@ -190,7 +190,7 @@ async def restore(number: Number, dashboard: Dash) -> Response:
 
 
 @router.post("/{key}/replay")
-async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
+async def replay(key: _Key, dashboard: Dash, settings: Deployment, permitted: Permitted) -> Response:
     """Open the source of a run again, with its topics, mounting and final parameters. The response is empty
     (202); the status reports the result. 403 if the file may not be opened by the caller, 404 for an unknown
     run, 409 if its source cannot be opened, 422 if its parameters are not valid in this version."""
@@ -203,7 +203,7 @@ async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: Any
         preset=run["preset"],
         parameters=run["parameters"],
     )
-    await dashboard.open(permitted_request(request, settings, any_file))
+    await dashboard.open(permitted_request(request, permitted))
     return json_reply({}, 202)
 
 
