@@ -32,7 +32,7 @@ from app.dashboard.payload import clearance_payload, trees_payload
 from app.robot.address import ROOT, ZenohAddress, is_live
 from app.robot.link import Inbox
 from app.robot.zenoh import ZenohLink
-from app.sources import inspection
+from app.sources import opening
 from app.web.app import FleetLink, MakeScene, MakeWorker, build, guarded
 from app.web.auth import AccessTokens, role_of
 from app.web.responses import error_reply
@@ -140,7 +140,7 @@ async def _aligned(reference: Map, local: Map) -> tuple[Pose2 | None, str]:
     the reason. It is computed in a child process; its errors are returned as the reason."""
     question = {"ask": "alignment", "local": _stems(local), "reference": _stems(reference)}
     try:
-        found = await inspection.ask(question)
+        found = await opening.ask(question)
     except StemmapError as error:
         return None, error.what
     if found["pose"] is None:

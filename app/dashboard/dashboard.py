@@ -27,7 +27,7 @@ from app.dashboard.run_recorder import ReviewedRuns, RunRecorder
 from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
 from app.dashboard.shown_run import ShownRun, truth_in_file
-from app.sources.inspection import check_source
+from app.sources.opening import check_source
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.jobs import RunWithTruth

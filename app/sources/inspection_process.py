@@ -1,6 +1,6 @@
 """The child process that inspects files and robots from outside: `python -m app.sources.inspection_process`.
 
-`app.sources.inspection.ask` starts it and asks one of `QUESTIONS`.
+`app.sources.opening.ask` starts it and asks one of `QUESTIONS`.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
-from app.sources.inspection import MEMORY_LIMIT
-from app.sources.opening import open_cloud, open_source
+from app.sources.opening import MEMORY_LIMIT, open_cloud, open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import is_cloud

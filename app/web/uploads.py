@@ -17,7 +17,7 @@ from fastapi import APIRouter, Query, Request
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
 
-from app.sources import inspection
+from app.sources import opening
 from app.store.async_store import AsyncStore
 from app.web.auth import UPLOADS
 from app.web.responses import json_reply
@@ -306,8 +306,8 @@ async def _look_at(part: Path, name: str) -> str:
         UploadError: The file cannot be read.
     """
     try:
-        found = await inspection.ask({"ask": "recording", "path": str(part)})
-    except inspection.TookTooLongError:
+        found = await opening.ask({"ask": "recording", "path": str(part)})
+    except opening.TookTooLongError:
         return "not looked through yet"  # a very large file; errors appear when it is opened
     except StemmapError as error:
         # The path is that of the incomplete file; the person knows the original name.

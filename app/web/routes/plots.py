@@ -25,7 +25,7 @@ from app.batch.georeference import NAME_MAX
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.selection import NothingMappedError
 from app.dashboard.shown_run import ShownRun
-from app.sources import inspection
+from app.sources import opening
 from app.store.records import FRAME, PLOT, Content, UnknownError
 from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, as_bad_request, json_reply
@@ -161,7 +161,7 @@ async def import_file(body: _ImportPlots, dashboard: Dash) -> Response:
         async with in_thread(run.folder()) as run_folder:
             question = {"ask": "plots", "path": str(file), "run": str(run_folder), "crs": body.crs.strip()}
             with as_bad_request(where=file.name):
-                read = await inspection.ask(question)
+                read = await opening.ask(question)
     x, y = dashboard.offset
     moved = [
         [[[[px - x, py - y] for px, py in ring] for ring in part] for part in plot["polygons"]]
@@ -352,7 +352,7 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
         elif isinstance(body.by, _Gnss):
             question["start_ns"] = run.start_ns
         with as_bad_request(where=""):
-            found = await inspection.ask(question, patience_s=_GNSS_PATIENCE_S)
+            found = await opening.ask(question, patience_s=_GNSS_PATIENCE_S)
     points = [_named(point, 0, (-offset[0], -offset[1])) for point in found["points"]]
     if len(points) > _MOST_POINTS:
         raise BadRequestError(

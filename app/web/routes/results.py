@@ -23,7 +23,7 @@ from app.dashboard.payload import (
 from app.dashboard.scores import pairs_payload
 from app.dashboard.selection import NothingMappedError
 from app.dashboard.shown_run import ShownRun
-from app.sources import inspection
+from app.sources import opening
 from app.web.responses import (
     LARGEST_NUMBER,
     Body,
@@ -119,7 +119,7 @@ async def export_cloud(
     with as_bad_request():
         async with in_thread(run.folder()) as folder:
             question = {"ask": "cloud", "path": str(folder), "file": str(file)}
-            await inspection.ask(question, patience_s=_CLOUD_S)
+            await opening.ask(question, patience_s=_CLOUD_S)
     return FileResponse(
         file, 200, {"Cache-Control": "no-store"}, "application/octet-stream", filename=file.name
     )

@@ -14,7 +14,7 @@ from fastapi import APIRouter
 from pydantic import Field, field_validator
 from starlette.responses import Response
 
-from app.sources.inspection import ask
+from app.sources.opening import ask
 from app.sources.request import LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
 from app.web.responses import BadRequestError, Body, Value, Word, json_reply
 from app.web.routes.access import Dash, Deployment, Permitted, checked_uri, permitted_request

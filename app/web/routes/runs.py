@@ -26,7 +26,7 @@ from app.batch.run_folder import read_run_record
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.shown_run import ShownRun
-from app.sources import inspection
+from app.sources import opening
 from app.sources.request import request_of_kept
 from app.store.records import NoFilesError, UnknownError
 from app.store.store import RunRecords
@@ -112,7 +112,7 @@ async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b:
             "names": [first["name"], second["name"]],
             "same_frame": bool(first["source"]) and first["source"] == second["source"],
         }
-        found = await inspection.ask(question)
+        found = await opening.ask(question)
     path = np.array(second["map"]["path"], np.float64).reshape(-1, 2)
     return json_reply(
         {
@@ -155,7 +155,7 @@ async def report(
                 "plots": [(plot.name, mapping(plot.shape)) for plot in plots],
                 "parameters": parameters.model_dump(),
             }
-            await inspection.ask(question, patience_s=_REPORT_S)
+            await opening.ask(question, patience_s=_REPORT_S)
             return bytes_reply(await asyncio.to_thread(file.read_bytes), filename=file.name)
 
 
@@ -316,7 +316,7 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
         name = key.removeprefix(_FOLDER)
         folder = await asyncio.to_thread(_finished_folder, name, settings)
         async with _with_edits(folder, dashboard) as (reviewed, _):
-            found = await inspection.ask({"ask": "finished", "path": str(reviewed)})
+            found = await opening.ask({"ask": "finished", "path": str(reviewed)})
         run = {"key": key, "name": name, "revisions": [], **found}
     else:
         number = _number(key)

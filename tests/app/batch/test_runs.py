@@ -19,7 +19,7 @@ from app.dashboard import run_recorder
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
 from app.dashboard.shown_run import ShownRun
-from app.sources import inspection
+from app.sources import opening
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.database import maps
 from app.store.records import Author, Content
@@ -408,12 +408,12 @@ async def test_a_reader_that_dies_or_hangs_is_an_error_for_people() -> None:
 
     dies = (sys.executable, "-c", "import os; os.abort()")
     with pytest.raises(SourceError, match="ended without an answer"):
-        await inspection.ask({"ask": "recording", "path": __file__}, command=dies)
+        await opening.ask({"ask": "recording", "path": __file__}, command=dies)
     hangs = (sys.executable, "-c", "import threading; threading.Event().wait()")
-    with pytest.raises(inspection.TookTooLongError):
-        await inspection.ask({"ask": "recording", "path": __file__}, command=hangs, patience_s=0.2)
+    with pytest.raises(opening.TookTooLongError):
+        await opening.ask({"ask": "recording", "path": __file__}, command=hangs, patience_s=0.2)
     with pytest.raises(SourceError, match="no such file"):
-        await inspection.ask({"ask": "recording", "path": "/no/such.mcap"})
+        await opening.ask({"ask": "recording", "path": "/no/such.mcap"})
 
 
 def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:

@@ -17,8 +17,8 @@ from app.common.settings import Settings
 from app.robot.link import Inbox
 from app.robot.source import open_any
 from app.robot.topics import Publisher
-from app.sources import inspection, inspection_process
-from app.sources.inspection import ask, check_source
+from app.sources import inspection_process, opening
+from app.sources.opening import ask, check_source
 from app.sources.request import SourceRequest
 from app.worker.protocol import Open
 from app.worker.session import Session
@@ -124,25 +124,25 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
 
 
 async def test_a_source_is_checked_up_to_its_first_scan(tmp_path: Path, run: Path) -> None:
-    await inspection.check_source(SourceRequest(str(run), mount=(0.0, 0.0, 2.0, 0.0, 0.0, 0.0)))
+    await opening.check_source(SourceRequest(str(run), mount=(0.0, 0.0, 2.0, 0.0, 0.0, 0.0)))
     notes, cut = tmp_path / "notes.txt", tmp_path / "cut.mcap"
     notes.write_text("birch, birch, oak")
     cut.write_bytes(run.read_bytes()[:60])
     for uri, reason in ((notes, "not a LiDAR recording.*Supported formats"), (cut, "cut.mcap")):
         with pytest.raises(SourceError, match=reason):
-            await inspection.check_source(SourceRequest(str(uri)))
+            await opening.check_source(SourceRequest(str(uri)))
     with pytest.raises(SourceError, match="no topic /other"):
-        await inspection.check_source(SourceRequest(str(run), topics={"scan": "/other"}))
+        await opening.check_source(SourceRequest(str(run), topics={"scan": "/other"}))
 
 
 @pytest.mark.parametrize("uri", ["sim:stand?seed=2", "velodyne:0.0.0.0:2368?from=192.168.1.201"])
 async def test_of_simulated_and_live_sources_the_address_is_checked(
     uri: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delattr(inspection, "ask")  # no child process
-    await inspection.check_source(SourceRequest(uri))
+    monkeypatch.delattr(opening, "ask")  # no child process
+    await opening.check_source(SourceRequest(uri))
     with pytest.raises(SourceError):
-        await inspection.check_source(SourceRequest(uri + "&nothing=5"))
+        await opening.check_source(SourceRequest(uri + "&nothing=5"))
 
 
 async def test_the_choice_goes_to_the_worker(both: Running) -> None:

@@ -432,7 +432,7 @@ async def test_the_cloud_is_sent_from_a_file_that_is_removed(both: Running, monk
         Path(question["file"]).write_bytes(b"LASF")
 
     monkeypatch.setattr("app.web.routes.results.LARGE", tmp_path)
-    monkeypatch.setattr("app.sources.inspection.ask", ask)
+    monkeypatch.setattr("app.sources.opening.ask", ask)
     reply = await client.get("/api/export/laz")
     assert reply.content == b"LASF"
     assert reply.headers["content-disposition"] == 'attachment; filename="cloud.laz"'

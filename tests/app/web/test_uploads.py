@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from app.common.settings import Settings
-from app.sources import inspection
+from app.sources import opening
 from app.store.async_store import AsyncStore
 from app.web import uploads
 from app.web.uploads import UploadError, Uploads
@@ -37,7 +37,7 @@ def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             return {"kind": "fake recording", "scans": 3}
         raise SourceError("unknown format", where=str(path), remedy="Readable are: good ones.")
 
-    monkeypatch.setattr(inspection, "ask", look)
+    monkeypatch.setattr(opening, "ask", look)
     return tmp_path / "recordings"
 
 
