@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
             cannot be written.
     """
     from app.batch import georeference
-    from app.batch.plot_files import stored_frame
+    from app.batch.run_edits import stored_frame
     from app.batch.run_folder import read_run_record
 
     folder = arguments.run

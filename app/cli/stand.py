@@ -142,7 +142,7 @@ def chosen_plots(arguments: argparse.Namespace) -> list[SamplePlot]:
     if all(each is None for each in given):
         return _drawn_plots(arguments.run)
     if arguments.plots is not None and str(arguments.plots) != NO_PLOTS:
-        from app.batch.plot_files import read_plots
+        from app.batch.run_edits import read_plots
 
         plots += read_plots(arguments.plots, arguments.run, crs=arguments.plots_crs)
     for sizes in (*(c[2:] for c in arguments.circle), *(r[2:4] for r in arguments.rectangle)):
@@ -197,7 +197,7 @@ def reviewed(run: Path) -> Iterator[Path]:
     """
     import sys
 
-    from app.batch.reviews import reviewed_run, stored_reviews
+    from app.batch.run_edits import reviewed_run, stored_reviews
     from app.batch.run_folder import read_run
     from app.common.text import count
 
@@ -217,7 +217,7 @@ def _drawn_plots(run: Path) -> list[SamplePlot]:
     """
     import sys
 
-    from app.batch.plot_files import stored_plots
+    from app.batch.run_edits import stored_plots
     from app.common.text import count
 
     plots = stored_on_page(run, stored_plots) or []

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from app.batch.reviews import SAME_THING
+from app.batch.run_edits import SAME_THING
 from app.store.async_store import AsyncStore
 from app.store.records import FRAME, KINDS, PLOT, SKIPPED, Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError

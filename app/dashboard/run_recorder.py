@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.batch.reviews import reviews_of
+from app.batch.run_edits import reviews_of
 from app.batch.summary import lost_share
 from app.dashboard.payload import trees_payload, truth_payload
 from app.dashboard.shown_run import ShownRun

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.batch.georeference import write_map_frame
-from app.batch.plot_files import placed
-from app.batch.reviews import reviews_of
+from app.batch.run_edits import placed, reviews_of
 from app.batch.run_folder import as_written, recorded_time, score_map
 from app.batch.summary import far_truth, unconfirmed_warning
 from app.common.text import changed_values, version

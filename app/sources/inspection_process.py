@@ -139,11 +139,11 @@ def plots(question: dict[str, Any]) -> dict[str, Any]:
             a file without one, "local" or "".
 
     Raises:
-        StemmapError: See `app.batch.plot_files.read_plots`.
+        StemmapError: See `app.batch.run_edits.read_plots`.
     """
     import shapely
 
-    from app.batch.plot_files import read_plots
+    from app.batch.run_edits import read_plots
 
     found = read_plots(Path(question["path"]), Path(question["run"]), crs=question["crs"] or None)
     rows = []

@@ -252,7 +252,7 @@ def _written(files: Mapping[str, str], folder: FilePath) -> FilePath:
     """Write files, a dict from names to their bytes in base64, to a folder. Return the path of the file that
     is read: the first one with a suffix of SUFFIXES, in the order of SUFFIXES. Raises BadRequestError if
     there is none, or for other text than base64."""
-    from app.batch.plot_files import SUFFIXES
+    from app.batch.run_edits import SUFFIXES
 
     for name, text in files.items():
         try:

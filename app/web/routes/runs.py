@@ -20,8 +20,7 @@ from shapely.geometry import mapping
 from starlette.responses import Response
 
 from app.batch.georeference import write_map_frame
-from app.batch.plot_files import stored_frame, stored_plots
-from app.batch.reviews import reviewed_run, stored_reviews
+from app.batch.run_edits import reviewed_run, stored_frame, stored_plots, stored_reviews
 from app.batch.run_folder import read_run_record
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard

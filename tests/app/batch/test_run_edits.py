@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from app.batch.reviews import SAME_THING, reviewed_run, reviews_of
+from app.batch.run_edits import SAME_THING, reviewed_run, reviews_of
 from app.batch.run_folder import read_run, read_terrain
 from app.store.records import PLOT, SKIPPED, Author, Content
 from app.store.store import Store

@@ -1,24 +1,127 @@
-"""Plots from GIS files: GeoPackage, Shapefile and GeoJSON."""
+"""What people add to a run: reviews of its trees, its sample plots, also from GIS files (GeoPackage,
+Shapefile and GeoJSON), and the reference system of its map.
+
+A review decides whether a mapped tree is a tree in the figures and files that are handed in. The map is not
+changed. An annotation of a class other than "tree" rejects the mapped tree at its place.
+"""
 
 from __future__ import annotations
 
+import csv
 import json
 import math
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 
 from app.batch.georeference import LOCAL, LOCAL_NAME, MapFrame, gis_package, read_map_frame
-from app.store.records import FRAME, PLOT
+from app.batch.run_folder import read_run
+from app.store.records import FRAME, KINDS, PLOT, SKIPPED, Content
 from pipeline.errors import SourceError, StemmapError
+from pipeline.geometry.poses import Float
+from pipeline.io.atomic_files import write_texts
+from pipeline.io.result_files import CONFIRMED, OPEN, REJECTED, TREE_COLUMNS, csv_text
 from pipeline.stand.plots import PLOTS_MAX, SamplePlot, checked, circle, plot_of
 
 if TYPE_CHECKING:
-    from app.store.records import Content
     from app.store.store import Store
+
+# Largest distance between an annotation and the same object in a map or a ground truth [m].
+SAME_THING = 0.5
+# What figures and exports of a run need, besides its trees.
+_FILES = ("path.csv", "terrain.csv", "seen.csv", "run.json", "georeference.json")
+
+
+def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> dict[int, str]:
+    """Return a dict from the number of each reviewed tree to its review: CONFIRMED for the class "tree",
+    REJECTED for another class, SKIPPED if no annotation of the tree states a class.
+
+    An annotation belongs to the tree that is nearest to it, if it is nearer than SAME_THING. Of several
+    annotations of a tree the nearest one that states a class counts, of equally near ones the last. The page
+    has the same rule (`paired` in static/js/annotate/annotations.js).
+
+    Args:
+        numbers, position: Numbers of the trees, and their positions in the map, shape (T, 2) [m].
+        contents: The annotations in the same frame; plots and frames are ignored.
+    """
+    from scipy.spatial import cKDTree
+
+    states = {**dict.fromkeys(KINDS, REJECTED), "tree": CONFIRMED, SKIPPED: SKIPPED}
+    reviews = [content for content in contents if content.kind in states]
+    if not reviews or not len(numbers):
+        return {}
+    distance, row = cKDTree(position).query([(content.x, content.y) for content in reviews])
+    states_class = np.array([content.kind != SKIPPED for content in reviews])
+    found: dict[int, str] = {}
+    for k in np.lexsort((-distance, states_class)):  # the one that counts comes last
+        if distance[k] < SAME_THING:
+            found[numbers[row[k]]] = states[reviews[k].kind]
+    return found
+
+
+def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content]:
+    """Return the annotations of a recording that review trees, in the frame of the map.
+
+    Args:
+        store: The store.
+        source: Member `source` of run.json.
+    """
+    return [content for content in store.contents(_key(source)) if content.kind in (*KINDS, SKIPPED)]
+
+
+@contextmanager
+def reviewed_run(folder: FilePath, contents: Sequence[Content]) -> Iterator[FilePath]:
+    """Yield a folder with the run of `folder` in which trees.csv has the reviews by annotations of its
+    recording, and no others; the folder itself if there are neither annotations nor reviews. A temporary
+    folder is removed afterwards; errors name `folder` instead.
+
+    Args:
+        folder: Folder that `stemmap map` wrote.
+        contents: Annotations in the frame of the map.
+
+    Raises:
+        StemmapError: A file of the run is missing or damaged.
+    """
+    run = read_run(folder)  # checks the files
+    if not (contents or run.rejected or {*run.reviews.values()} - {OPEN}):
+        yield folder
+        return
+    offset = run.record["source"].get("offset_m", (0.0, 0.0))
+    placed = [replace(each, x=each.x + offset[0], y=each.y + offset[1]) for each in contents]
+    with (folder / "trees.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    numbers = [int(float(row["tree"])) for row in rows]
+    position = np.array([(float(row["x_m"]), float(row["y_m"])) for row in rows]).reshape(-1, 2)
+    reviews = reviews_of(numbers, position, placed)
+    texts = [
+        [{**row, "review": reviews.get(number, OPEN)}.get(name, "") for name in TREE_COLUMNS]
+        for number, row in zip(numbers, rows, strict=True)
+    ]
+    with TemporaryDirectory(prefix="stemmap-run-") as there:
+        for name in _FILES:
+            if (folder / name).is_file():
+                shutil.copy2(folder / name, FilePath(there) / name)  # with its date, which the report states
+        write_texts(FilePath(there), {"trees.csv": csv_text(TREE_COLUMNS, texts)})
+        try:
+            yield FilePath(there)
+        except StemmapError as error:
+            where = error.where.replace(there, str(folder))
+            raise type(error)(error.what, where=where, remedy=error.remedy) from error
+
+
+def _key(source: Mapping[str, Any]) -> str:
+    """Return the key of a recording in the store, from the member `source` of run.json."""
+    return str(source.get("sha256") or source.get("uri"))
+
+
+# --- plots ------------------------------------------------------------------------------------------
 
 LARGEST_FILE = 64 << 20
 SUFFIXES = (".gpkg", ".shp", ".zip", ".geojson", ".json")
@@ -95,14 +198,13 @@ def stored_plots(store: Store, source: Mapping[str, Any]) -> list[SamplePlot]:
         store: The store.
         source: Member `source` of run.json.
     """
-    contents = store.contents(str(source.get("sha256") or source.get("uri")), PLOT)
-    return placed(contents, source.get("offset_m", (0.0, 0.0)))
+    return placed(store.contents(_key(source), PLOT), source.get("offset_m", (0.0, 0.0)))
 
 
 def stored_frame(store: Store, source: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the reference system that the store has for a recording, in the form of `MapFrame.record`; None
     if there is none. Arguments as in `stored_plots`."""
-    contents = store.contents(str(source.get("sha256") or source.get("uri")), FRAME)
+    contents = store.contents(_key(source), FRAME)
     return contents[0].plot["frame"] if contents and contents[0].plot else None
 
 
