@@ -22,7 +22,7 @@ from app.dashboard.broadcast import Broadcast
 from app.dashboard.camera_view import CameraView
 from app.dashboard.events import Events
 from app.dashboard.parameters import ParameterSets, ParameterState
-from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
+from app.dashboard.payload import counts_before, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import ReviewedRuns, RunRecorder
 from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
@@ -86,10 +86,10 @@ class Dashboard:
         self.path_xy = np.zeros((0, 2))
         self._path_rows = _no_path()
         self._broadcast_map: tuple[dict[str, Any], Float] | None = None
+        self._map_before: dict[str, Any] | None = None  # the last change of parameters
         self.truth: TruthTrees | None = None
         self.seen = SeenRecorder()
         self.sets = ParameterSets(self.store, self._show_parameters)
-        self._before_after = BeforeAfter()
         self.worker_client = WorkerClient(lambda question: self.worker.send(question), lambda: self.run)
         self.camera = CameraView(self.worker_client)
         self.selector = Selector(self)
@@ -265,7 +265,7 @@ class Dashboard:
         before, step = self.parameters.parameters, self.parameters.step
         change(self.parameters)
         if self.parameters.step != step:
-            self._before_after.step()
+            self._map_before = self._broadcast_map and self._broadcast_map[0]
         await self._send_parameters()  # first: the scan is mapped again while the browsers are updated
         self._show_parameters()
         if self.shown is not None:
@@ -402,13 +402,12 @@ class Dashboard:
     async def _forget(self) -> None:
         """Remove map, path, observed area, selection, scores, events and the repetition of a part, and show
         the ground truth of the run that begins."""
-        self.shown = self.path = self._broadcast_map = None
+        self.shown = self.path = self._broadcast_map = self._map_before = None
         self.seen = SeenRecorder()
         self.path_xy = np.zeros((0, 2))
         self._path_rows = _no_path()
         self.live.forget_map()
         self.scores.forget()
-        self._before_after = BeforeAfter()
         self.events.forget()
         self._broadcast_events()
         self.loop.choose(None)
@@ -431,19 +430,22 @@ class Dashboard:
         index = -1 if self.shown is None else self.shown.frame.index
         if self.shown and self._broadcast_map and self._broadcast_map[0]["index"] == index:
             distance = self.parameters.parameters.evaluation.match_distance
-            self._show_map(*self._broadcast_map, counts_of(self.shown.frame, self.truth, distance))
+            payload, path_rows = self._broadcast_map
+            self._show_map(payload | counts_of(self.shown.frame, self.truth, distance), path_rows)
         self._score()
 
-    def _show_map(self, payload: dict[str, Any], path_rows: Float, counted: dict[str, Any]) -> None:
-        """Broadcast a map.
+    def _show_map(self, payload: dict[str, Any], path_rows: Float) -> None:
+        """Broadcast a map with `before`, the counts of this scan before the last change of parameters; None
+        if there was no change, or another scan was shown since then.
 
         Args:
             payload: Result of `map_payload`.
             path_rows: Positions x, y of path and odometry, shape (N, 4) [m].
-            counted: Result of `counts_of`.
         """
-        self._broadcast_map = payload, path_rows
-        self.live.show({**payload, **self._before_after.shown(payload["index"], counted)}, path_rows)
+        self._broadcast_map, before = (payload, path_rows), counts_before(self._map_before, payload)
+        if before is None:
+            self._map_before = None
+        self.live.show({**payload, "before": before}, path_rows)
 
     def _mark_edits(self, who: str, number: int) -> None:
         """Add an event for edits of annotations and broadcast it; nothing before the first scan.
@@ -478,12 +480,11 @@ class Dashboard:
             shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
         distance = self.parameters.parameters.evaluation.match_distance
-        payload = await asyncio.to_thread(map_payload, shown)
-        counted = await asyncio.to_thread(counts_of, shown.frame, self.truth, distance)
+        payload = await asyncio.to_thread(map_payload, shown, self.truth, distance)
         if number != self._opens:  # another source was requested meanwhile
             return
         payload["layers"] |= self.scene.counts
-        self._show_map(payload, path_rows, counted)
+        self._show_map(payload, path_rows)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
             self._broadcast_events()
         self.run_recorder.shown(ShownRun.of(self), self.scores.latest)

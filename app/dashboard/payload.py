@@ -23,13 +23,17 @@ _NS = 1_000_000_000
 _DIGITS = 4
 
 
-def map_payload(shown: Shown) -> dict[str, Any]:
+def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
     """Return the message "map" without its path and without points as a dict of JSON values.
 
     The keys are `type`, "map"; `index` and `time_s` of the scan [s since the first scan]; `pose` and `odom`,
     lists [x [m], y [m], yaw [rad]] of `T_map_base` and `T_odom_base`; `sigma_xy`, the root mean square of the
-    standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; and `health`, `trees`,
-    `verdicts`, `clusters`, `layers` and `clearance`, the results of the functions of this module.
+    standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; `health`, `trees`, `clusters`,
+    `layers` and `clearance`, the results of the functions of this module; and the keys of `counts_of`.
+
+    Args:
+        shown: The scan with the map.
+        truth, match_distance: As in `counts_of`.
     """
     frame = shown.frame
     estimate = frame.estimate
@@ -43,9 +47,9 @@ def map_payload(shown: Shown) -> dict[str, Any]:
         "n_eff": round(estimate.n_eff, 1),
         "health": health_payload(frame.health),
         "trees": trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),
-        "verdicts": verdict_counts(frame.clusters.verdict),
         "clusters": clusters_payload(frame),
         "counts": dict(frame.counts),
+        **counts_of(frame, truth, match_distance),
         "layers": layer_counts(frame),
         "clearance": clearance_payload(frame.clearance),
     }
@@ -218,31 +222,16 @@ def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> 
     return {"verdicts": verdicts, "right": right, "wrong": len(found) - right}
 
 
-class BeforeAfter:
-    """Keeps the verdict counts of the current scan before the last change of parameters."""
+def counts_before(before: dict[str, Any] | None, now: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the keys of `counts_of` of an earlier message "map" of the same scan; None if there is none.
 
-    def __init__(self) -> None:
-        self._now: tuple[int, dict[str, Any] | None] = (-1, None)  # index of the scan, and its counts
-        self._before: tuple[int, dict[str, Any] | None] = self._now
-
-    def step(self) -> None:
-        """Keep the counts of the last call of `shown` as those before the change of parameters that begins
-        now."""
-        self._before = self._now
-
-    def shown(self, index: int, counts: dict[str, Any]) -> dict[str, Any]:
-        """Set the counts of the displayed scan. Return a dict with `right` and `wrong` of these counts and
-        `before`, the counts of this scan before the last change; `before` is None if there was no change, or
-        if another scan was displayed since then.
-
-        Args:
-            index: Index of the scan.
-            counts: Result of `counts_of`.
-        """
-        self._now = (index, counts)
-        if self._before[0] != index:
-            self._before = (-1, None)
-        return {"right": counts["right"], "wrong": counts["wrong"], "before": self._before[1]}
+    Args:
+        before: The message before the last change of parameters; None without one.
+        now: The message that is shown.
+    """
+    if before is None or before["index"] != now["index"]:
+        return None
+    return {name: before[name] for name in ("verdicts", "right", "wrong")}
 
 
 REACH = 0.45  # m; maximum distance between a tree and its column

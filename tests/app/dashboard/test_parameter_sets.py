@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.cli.flags import chosen_parameters
-from app.dashboard.payload import BeforeAfter, counts_of
+from app.dashboard.payload import counts_before, counts_of
 from app.worker.protocol import Shown
 from pipeline.config import preset
 from tests.app.fakes import frame, opened, path, truth_trees
@@ -90,23 +90,17 @@ async def test_the_page_is_told_what_stood_before_a_change(both: Running) -> Non
     await dashboard.receive(Shown(1, 0.2, picture, 0, path([0.0, 0.5, 1.0])))
     told = json.loads(dashboard.live.map_after(0)[1])  # type: ignore[index]
     assert told["before"]["verdicts"] == told["verdicts"]
+    await dashboard.receive(Shown(1, 0.3, frame(3, 5_300_000_000, n_trees=4), 0, path([0.0, 0.5, 1.0])))
+    await dashboard.receive(Shown(1, 0.2, picture, 0, path([0.0, 0.5, 1.0])))  # back at the scan
+    assert json.loads(dashboard.live.map_after(0)[1])["before"] is None  # type: ignore[index]
 
 
-def test_before_is_of_the_same_scan_and_of_the_last_step():
-    watch = BeforeAfter()
-    assert watch.shown(1, {"verdicts": {"tree": 1}, "right": None, "wrong": None})["before"] is None
-    watch.step()
-    assert watch.shown(1, {"verdicts": {"tree": 2}, "right": 2, "wrong": 0})["before"] == {
-        "verdicts": {"tree": 1},
-        "right": None,
-        "wrong": None,
-    }
-    watch.shown(1, {"verdicts": {"tree": 3}, "right": 2, "wrong": 1})  # the slider moves on
-    watch.step()
-    assert watch.shown(1, {"verdicts": {"tree": 4}, "right": 2, "wrong": 2})["before"]["verdicts"] == {
-        "tree": 3
-    }
-    assert watch.shown(2, {"verdicts": {"tree": 4}, "right": 2, "wrong": 2})["before"] is None
+def test_before_is_of_the_same_scan():
+    counts = {"verdicts": {"tree": 1}, "right": None, "wrong": None}
+    before = {"type": "map", "index": 1, **counts}
+    assert counts_before(None, before) is None
+    assert counts_before(before, {**before, "verdicts": {"tree": 2}, "right": 2}) == counts
+    assert counts_before(before, {**before, "index": 2}) is None
 
 
 def test_detections_are_held_against_the_truth_where_they_stand():
