@@ -22,18 +22,19 @@ Value = float | int | bool | str
 CHANGED = "● "
 MAIN = tuple(spec for spec in field_specs() if spec.main)
 
-OnChange = Callable[[str, Value, viser.ClientHandle], None]
-OnPreset = Callable[[str, viser.ClientHandle], None]
-OnReset = Callable[[list[str], viser.ClientHandle], None]
+#: Calls a function with arguments on the loop of the server.
+Cross = Callable[..., None]
 
 
 class TunePanel:
-    """Sliders, a list of presets and a reset button. All callbacks run in the thread of viser.
+    """Sliders, a list of presets and a reset button. Actions of people, not changes by the server, become
+    commands.
 
     Args:
         gui: Panel of viser, at the place of the new widgets.
         parameters, preset_name: Initial values.
-        on_change, on_preset, on_reset: Called after actions of people, not after changes by the server.
+        tuning: Sends the commands.
+        cross: Called in the thread of viser to use `tuning` on the loop of the server.
     """
 
     def __init__(
@@ -41,28 +42,28 @@ class TunePanel:
         gui: viser.GuiApi,
         parameters: Parameters,
         preset_name: str,
-        on_change: OnChange,
-        on_preset: OnPreset,
-        on_reset: OnReset,
+        tuning: PanelCommands,
+        cross: Cross,
     ) -> None:
-        self._on_change = on_change
+        self._tuning, self._cross = tuning, cross
         self._widgets: dict[str, viser.GuiSliderHandle[Any]] = {}
         self._folders: list[viser.GuiFolderHandle] = []
         self._preset = gui.add_dropdown(
             "Preset", tuple(PRESETS), initial_value=preset_name, hint=_preset_hint()
         )
         self._summary = gui.add_markdown("")
-        button = gui.add_button("Reset all", color="gray", hint="Reset to the values of the preset.")
+        self._reset = gui.add_button("Reset all", color="gray", hint="Reset to the values of the preset.")
 
-        @button.on_click
+        @self._reset.on_click
         async def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:
-                on_reset([], event.client)
+            if (client := event.client) is not None:
+                cross(lambda: tuning.ask(tuning.commands.reset_parameters([]), client))
 
         @self._preset.on_update
         async def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:
-                on_preset(event.target.value, event.client)
+            if (client := event.client) is not None:
+                name = event.target.value
+                cross(lambda: tuning.ask(tuning.commands.use_preset(name), client))
 
         values = parameters.flat()
         for stage, specs in itertools.groupby(MAIN, lambda spec: spec.stage):
@@ -99,7 +100,7 @@ class TunePanel:
             folder.visible = not cloud
 
     def _add_widget(self, gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiSliderHandle[Any]:
-        """Add the slider of a parameter, whose changes by people call `on_change`, and return it.
+        """Add the slider of a parameter, whose changes by people are sent, and return it.
 
         Args:
             gui: Panel of viser.
@@ -115,7 +116,7 @@ class TunePanel:
         @widget.on_update
         async def _(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:  # None: set by the server
-                self._on_change(spec.name, _meant(spec, event.target.value), event.client)
+                self._cross(self._tuning.change, spec.name, _meant(spec, event.target.value), event.client)
 
         return widget
 
@@ -217,7 +218,7 @@ class PanelCommands:
     """
 
     def __init__(self, commands: SceneCommands, put_back: Callable[[], None]) -> None:
-        self._commands, self._put_back = commands, put_back
+        self.commands, self._put_back = commands, put_back
         self._waiting: dict[str, tuple[Value, _Origin]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._busy = False
@@ -260,7 +261,7 @@ class PanelCommands:
                 changes = {name: value for name, (value, of) in self._waiting.items() if of == origin}
                 self._waiting = {k: each for k, each in self._waiting.items() if k not in changes}
                 current_user.set(user)  # of this task only
-                await self._run_command(self._commands.change_parameters(changes), client)
+                await self._run_command(self.commands.change_parameters(changes), client)
         finally:
             self._busy = False
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from app.scene.colours import COLOUR_BY, ViewSettings
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
-from app.scene.panel import PanelCommands, SceneCommands, TunePanel, Value
+from app.scene.panel import PanelCommands, SceneCommands, TunePanel
 from app.scene.robot import RobotNodes, WayNode
 from app.scene.scan import ScanNodes, Vector, VoxelNode, extent
 from app.scene.viser_server import add_posed, messages_sent, silenced, start_server
@@ -182,9 +182,7 @@ class Scene:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 105, 78))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
-        self._tune = TunePanel(
-            gui, self._parameters, self._preset, self._on_change, self._on_preset, self._on_reset
-        )
+        self._tune = TunePanel(gui, self._parameters, self._preset, self._tuning, self._cross)
         add_hotkeys(gui, self._on_camera, functools.partial(self._cross, self._on_follow))
         self._add_nodes()
 
@@ -269,15 +267,6 @@ class Scene:
         """Call a function on the loop of the server, from any thread; nothing if the loop has ended."""
         with contextlib.suppress(RuntimeError):  # the loop has ended before viser's thread
             self._loop.call_soon_threadsafe(function, *arguments)
-
-    def _on_change(self, name: str, value: Value, client: viser.ClientHandle) -> None:
-        self._cross(self._tuning.change, name, value, client)
-
-    def _on_preset(self, name: str, client: viser.ClientHandle) -> None:
-        self._cross(lambda: self._tuning.ask(self._commands.use_preset(name), client))
-
-    def _on_reset(self, names: list[str], client: viser.ClientHandle) -> None:
-        self._cross(lambda: self._tuning.ask(self._commands.reset_parameters(names), client))
 
     def _on_tree(self, number: int) -> None:
         """Select a tree, or clear the selection if it is selected already."""

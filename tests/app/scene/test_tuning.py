@@ -28,10 +28,15 @@ class Person:
 
 async def moved(scene: Scene, name: str, value: float | int | bool | str) -> Person:
     """Move a slider as viser does when a browser says so, in viser's own thread."""
+    return await acted(scene, scene._tune._widgets[name], value)
+
+
+async def acted(scene: Scene, widget: Any, value: float | int | bool | str) -> Person:
+    """Use any widget of the panel in this way."""
     person = Person()
     server = scene._server
     server._connected_clients[0] = person  # type: ignore[assignment]
-    message = _messages.GuiUpdateMessage(scene._tune._widgets[name]._impl.uuid, {"value": value})
+    message = _messages.GuiUpdateMessage(widget._impl.uuid, {"value": value})
     handlers = server._websock_server._incoming_handlers[_messages.GuiUpdateMessage]
     for handler in handlers:
         future = asyncio.run_coroutine_threadsafe(handler(0, message), server._event_loop)  # type: ignore[arg-type]
@@ -130,11 +135,10 @@ async def test_a_value_of_another_kind_is_dropped(scene: Scene, recorder: Record
 
 
 async def test_presets_and_resets_are_asked_for(scene: Scene, recorder: Recorder):
-    person = Person()
-    scene._on_preset("paper", person)  # type: ignore[arg-type]
-    scene._on_reset(["clustering.eps"], person)  # type: ignore[arg-type]
+    await acted(scene, scene._tune._preset, "paper")
+    await acted(scene, scene._tune._reset, True)
     await until(lambda: len(recorder.asked) == 2)
-    assert recorder.asked == [("preset", "paper"), ("reset", ["clustering.eps"])]
+    assert recorder.asked == [("preset", "paper"), ("reset", [])]
 
 
 async def test_a_click_on_a_tree_selects_it_and_another_lets_it_go(scene: Scene, recorder: Recorder):
