@@ -147,7 +147,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     saved = read_saved_run(arguments.continued) if arguments.continued else None
-    start = _in_the_map(arguments.start)
+    start: Start = arguments.start or "auto"
     if saved and start == "auto" and is_live(arguments.source):
         raise StemmapError(
             "a robot that is driving cannot be located in a saved map by its stems",
@@ -224,26 +224,19 @@ def _tell(
     return 3 if losses else 0
 
 
-def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
-    """Return the start of --start: a pose for three numbers (m, m, rad), "last" and "resume" as they are,
-    else "auto", also for None."""
-    from pipeline.geometry.poses import Pose2
-
-    if isinstance(start, tuple):
-        return Pose2(*start)
-    return "last" if start == "last" else "resume" if start == "resume" else "auto"
-
-
-def _start(text: str) -> str | tuple[float, float, float]:
-    """Parse --start: auto, last, resume, or x, y [m], yaw [deg], which is returned in radians; raises
+def _start(text: str) -> Start:
+    """Parse --start: auto, last, resume, or x, y [m], yaw [deg], which is returned as a pose; raises
     argparse.ArgumentTypeError for other texts and for numbers beyond 1e6."""
-    if text in ("auto", "last", "resume"):
-        return text
+    named: dict[str, Start] = {"auto": "auto", "last": "last", "resume": "resume"}
+    if text in named:
+        return named[text]
     try:
         x, y, yaw = flags.numbers("X,Y,YAW", 1e6)(text)
     except argparse.ArgumentTypeError:
         raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or X,Y,YAW") from None
-    return x, y, math.radians(yaw)
+    from pipeline.geometry.poses import Pose2
+
+    return Pose2(x, y, math.radians(yaw))
 
 
 # --- live sources ------------------------------------------------------------------------------------
