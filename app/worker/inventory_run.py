@@ -189,9 +189,6 @@ class InventoryRun:
     def approach(self, index: int) -> None:
         """Do nothing: there is one scan."""
 
-    def prepare(self) -> None:
-        """Do nothing: the kernels are compiled by the first inventory."""
-
     def map_next(self, *, hurried: bool = False) -> Frame | None:
         """Compute the next step of the first inventory. Return the frame of the map if this step completed
         the map; None if it is not complete yet, or was complete before the call.
