@@ -60,7 +60,6 @@ class Dashboard:
     Attributes:
         status: Newest status of the worker.
         shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
-        truth: Ground truth with annotations; None where none is known.
         seen: Views of the observed area.
         results: Folder of stored results of sensitivity curves and searches; None if there is no data folder.
         run: Number of the open run at the worker; None before it is open.
@@ -87,7 +86,6 @@ class Dashboard:
         self._path_rows = _no_path()
         self._broadcast_map: tuple[dict[str, Any], Float] | None = None
         self._map_before: dict[str, Any] | None = None  # the last change of parameters
-        self.truth: TruthTrees | None = None
         self.seen = SeenRecorder()
         self.sets = ParameterSets(self.store, self._show_parameters)
         self.worker_client = WorkerClient(lambda question: self.worker.send(question), lambda: self.run)
@@ -106,6 +104,11 @@ class Dashboard:
         self._opening = asyncio.Lock()
         self._go = False
         self._show_scene = Throttle(lambda frame, path: self.scene.show(frame, path), pause_s=_SCENE_PAUSE_S)
+
+    @property
+    def truth(self) -> TruthTrees | None:
+        """Ground truth with annotations; None where none is known."""
+        return self.annotation_editor.truth
 
     @property
     def start_ns(self) -> int:
@@ -421,7 +424,6 @@ class Dashboard:
     def _use_truth(self) -> None:
         """Show the ground truth with the annotations in scene and browsers, and request the score of the map
         against it; without ground truth the score is removed."""
-        self.truth = self.annotation_editor.truth
         self.scene.show_truth(self.truth)
         self.live.publish("truth", truth_payload(self.truth))
         self.live.publish("annotations", self.annotation_editor.as_plain())

@@ -253,7 +253,7 @@ async def test_what_cannot_be_searched_for_is_refused(both: Running, body, words
 async def test_without_truth_or_a_result_there_is_nothing_to_do(both: Running):
     client, dashboard = both
     assert (await client.post("/api/search/use", json={})).status_code == 409
-    dashboard.truth = None
+    dashboard.annotation_editor.truth = None
     answer = await client.post("/api/search", json=BODY)
     assert (answer.status_code, answer.json()["error"]["what"]) == (
         409,
