@@ -30,26 +30,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train a forest with the annotations of the runs that the arguments name (all without any), print its
-    scores, and write it to `--out`, or without it to the data folder; return 0.
+    """Train a forest with the annotations of the runs that the arguments name by URI or by their name in the
+    dashboard (all without any), print its scores and those of the forest of the preset "forest", and write it
+    to `--out`, or without it to the data folder; return 0. Warnings and, on a terminal, progress go to
+    standard error.
 
     Raises:
-        StemmapError: See `learn_from_annotations`.
-    """
-    return learn_from_annotations(arguments.runs, arguments.out, arguments.seed)
-
-
-def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int:
-    """Train a random forest with annotations, print its scores and those of the forest of the preset
-    "forest", and write it; return 0. Warnings and, on a terminal, progress go to standard error.
-
-    Args:
-        names: Annotated runs by URI or by their name in the dashboard; empty for all.
-        out: File to write; None for the data folder.
-        seed: Random seed.
-
-    Raises:
-        StemmapError: There is no data folder, a run is unknown, the folder for `out` does not exist, there
+        StemmapError: There is no data folder, a run is unknown, the folder for `--out` does not exist, there
             are too few annotations, or a file cannot be read or written; see also `learn`.
     """
     from contextlib import closing
@@ -60,18 +47,18 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
     from app.training.learning import learn, table_lines
     from pipeline.config import preset
 
-    settings = from_environment()
+    settings, out = from_environment(), arguments.out
     if settings.folder is None:
         raise StemmapError("there is no data folder with annotations", remedy="Set STEMMAP_FOLDER")
     if out is not None and not out.absolute().parent.is_dir():
         raise StemmapError("the folder for --out does not exist", where=str(out.parent))
     with closing(Store(settings.folder)) as store:
-        runs = _chosen(store, names)
+        runs = _chosen(store, arguments.runs)
     learned = learn(
         runs,
         preset("forest").classification,
         settings.folder,
-        seed=seed,
+        seed=arguments.seed,
         progress=lambda words: print(plain(words), file=sys.stderr) if sys.stderr.isatty() else None,
     )
     for line in table_lines(learned):
