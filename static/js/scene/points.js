@@ -4,7 +4,7 @@ const TILT = 1.5; // [rad] largest tilt from the vertical
 
 export const newEye = () => ({ yaw: Math.PI / 2, tilt: 0.95, scale: 12, x: 0, y: 0 });
 
-// Decodes the block of `app/dashboard/picture_payload.py`: its header with the arrays by name.
+// Decodes the block of `binary_payload` (`app/dashboard/payload.py`): its header with the arrays by name.
 export function unpack(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
