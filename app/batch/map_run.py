@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,16 +47,6 @@ from pipeline.stand.seen_area import SeenArea, SeenRecorder, ViewSelection
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
 MEASURED_SCANS = 100_000  # whose times enter the medians
-
-
-class Progress(Protocol):
-    """A progress display, such as tqdm."""
-
-    def update(self, n: int = 1, /) -> object:
-        """Add completed scans."""
-
-    def close(self) -> None:
-        """End the display."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,16 +99,13 @@ class MappingResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
-def map_run(
-    plan: OfflineRun, folder: FilePath, progress: Progress, earlier: FilePath | None = None
-) -> MappingResult:
+def map_run(plan: OfflineRun, folder: FilePath, earlier: FilePath | None = None) -> MappingResult:
     """Map a run, write its files, and return the result for people. The source stays open. Pictures of trees
     are written at the end, if the source has a camera and no map is continued; their errors are warnings.
 
     Args:
         plan: The run.
         folder: Folder for the files; those of an earlier run are replaced.
-        progress: Updated after each scan, and closed at the end.
         earlier: Folder of the run that is continued, or None.
 
     Raises:
@@ -128,8 +114,8 @@ def map_run(
         OSError: The folder cannot be written; it is unchanged then.
     """
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
-    with closing(progress), RunFiles(folder, earlier) as files, on_compiling(stopwatch.disturb):
-        outcome, mapped = _map(plan, files, progress, stopwatch, earlier)
+    with RunFiles(folder, earlier) as files, on_compiling(stopwatch.disturb):
+        outcome, mapped = _map(plan, files, stopwatch, earlier)
     if plan.continued is None:  # the path of an earlier drive has no pictures here
         _keep_pictures(mapped, folder, outcome)
     return outcome
@@ -146,7 +132,6 @@ class _Mapped(NamedTuple):
 def _map(
     plan: OfflineRun,
     files: RunFiles,
-    progress: Progress,
     stopwatch: Stopwatch,
     earlier: FilePath | None,
 ) -> tuple[MappingResult, _Mapped]:
@@ -154,7 +139,7 @@ def _map(
     `map_run`.
 
     Args:
-        plan, progress, earlier: As in `map_run`.
+        plan, earlier: As in `map_run`.
         files: Output files.
         stopwatch: Measures the stages.
     """
@@ -166,9 +151,7 @@ def _map(
     left_out = Counter[str]()
     to_map = begun.steps(plan.source, chosen.steps, left_out)
     seen = SeenRecorder()
-    frame, start_ns = _map_scans(
-        plan, mapper, begun, islice(to_map, plan.stop_after), files, progress, stopwatch, seen
-    )
+    frame, start_ns = _map_scans(plan, mapper, begun, islice(to_map, plan.stop_after), files, stopwatch, seen)
     tally = begun.tally
     path, truth = mapper.path, _truth(plan, begun)
     evaluation = None
@@ -212,7 +195,6 @@ def _map_scans(
     begun: RunStart,
     to_map: Iterable[Step],
     files: RunFiles,
-    progress: Progress,
     stopwatch: Stopwatch,
     seen: SeenRecorder,
 ) -> tuple[Frame, int]:
@@ -224,7 +206,6 @@ def _map_scans(
         begun: How the run begins; its tally is updated.
         to_map: Steps of the scans.
         files: Output files.
-        progress: Updated after each scan.
         stopwatch: Measures the stages.
         seen: Recorder to which the views of the scans are added.
 
@@ -245,7 +226,6 @@ def _map_scans(
         start_ns = frame.stamp_ns if start_ns is None else start_ns
         files.add(frame, start_ns)
         begun.tally.add(frame)
-        progress.update(1)
     if frame is None or start_ns is None:
         mapped = " that was not mapped yet" if begun.scans else ""
         raise SourceError(f"there is no scan in it{mapped}", where=plan.source.description.uri)

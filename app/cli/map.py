@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from app.batch.continue_map import Start
     from app.robot.source import LiveSource
     from pipeline.io.readers import Source
+    from pipeline.mapper import Mapper
+    from pipeline.types.records import Frame
 
 
 NOT_TIMED = "not timed: the only scan loads the compiled code"
@@ -179,23 +181,29 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         if live is not None:
             live.use_parameters(0, 0, parameters)
         compile_ahead()
-        plan = OfflineRun(
-            source=opened,
-            preset=preset_name,
-            parameters=parameters,
-            seed=arguments.seed,
-            odometry=arguments.odometry,
-            truth_trees=truth_trees,
-            continued=ContinuedMap(saved, start) if saved else None,
-            stop_after=arguments.stop_after,
-            revisions=revisions,
-            on_frame=None if live is None else lambda frame, mapper: live.mapped(frame, mapper.path),
-            chosen=chosen,
-        )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
-        bar = flags.progress_bar(opened.description.scans, "scan", "mapping")
-        outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
+        with flags.progress_bar(opened.description.scans, "scan", "mapping") as bar:
+
+            def mapped(frame: Frame, mapper: Mapper) -> None:
+                if live is not None:
+                    live.mapped(frame, mapper.path)
+                bar.update(1)
+
+            plan = OfflineRun(
+                source=opened,
+                preset=preset_name,
+                parameters=parameters,
+                seed=arguments.seed,
+                odometry=arguments.odometry,
+                truth_trees=truth_trees,
+                continued=ContinuedMap(saved, start) if saved else None,
+                stop_after=arguments.stop_after,
+                revisions=revisions,
+                on_frame=mapped,
+                chosen=chosen,
+            )
+            outcome = map_run(plan, arguments.out, arguments.continued)
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
     return _tell(

@@ -38,16 +38,6 @@ MAP_FILES = ("trees.csv", "path.csv", "detections.csv", "trees.geojson", "terrai
 TUNED = Parameters().replace({"clustering.min_points": 6})
 
 
-class Silent:
-    """A progress bar that nobody sees."""
-
-    def update(self, n: int = 1, /) -> object:
-        return n
-
-    def close(self) -> None:
-        pass
-
-
 @pytest.fixture(scope="module")
 def stand(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two seconds of a simulated stand."""
@@ -123,7 +113,7 @@ def map_files(source: Source, out: Path, **plan: Any) -> dict[str, bytes]:
     run = OfflineRun(
         source=source, preset="forest", seed=0, odometry="auto", **{"parameters": Parameters(), **plan}
     )
-    map_run(run, out, progress=Silent())
+    map_run(run, out)
     return {name: (out / name).read_bytes() for name in MAP_FILES}
 
 
