@@ -4,6 +4,7 @@ over time, in bounded memory."""
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -169,11 +170,12 @@ class ScanCounts:
     def __init__(self) -> None:
         # Numbers of clusters by verdict and of scans by state, and the largest known sigma [m].
         self._rows = GrowingColumns(np.zeros((0, len(Verdict) + len(_STATES)), np.int32), np.zeros(0))
-        self._warned: list[Counter[str]] = []
+        self._warned: list[tuple[int, tuple[str, ...]]] = []  # scans with warnings, ascending
+        self._counted, self._warnings = 0, Counter[str]()  # so many of them, and their warnings
 
     def record(self, frame: Frame) -> None:
         """Add the scan after the last one; any other scan is ignored, also one that is mapped again."""
-        known, sigma = len(self._warned), frame.health.sigma_xy
+        known, sigma = len(self._rows), frame.health.sigma_xy
         if frame.index != known:
             return
         totals, largest = (self._rows.column(k)[-1:] for k in range(2))
@@ -184,13 +186,15 @@ class ScanCounts:
             totals.sum(axis=0, keepdims=True) + counted,
             np.array([np.fmax.reduce([*largest, sigma if math.isfinite(sigma) else math.nan])]),
         )
-        warned = self._warned[-1] if known else Counter[str]()
-        self._warned.append(warned + Counter(frame.warnings) if frame.warnings else warned)
+        if frame.warnings:
+            self._warned.append((known, tuple(frame.warnings)))
 
     def forget_from(self, index: int) -> None:
         """Remove the scan with this index and later ones."""
-        del self._warned[index:]
-        self._rows.return_to(len(self._warned))
+        self._rows.return_to(min(index, len(self._rows)))
+        del self._warned[bisect_left(self._warned, index, key=_scan_of) :]
+        if self._counted > len(self._warned):
+            self._counted, self._warnings = 0, Counter()
 
     def totals(self, index: int, warnings: Sequence[str], losses: Mapping[str, int]) -> RunCounts:
         """Return the totals up to a scan that was recorded. `health` has all states; `verdicts` and `losses`
@@ -207,8 +211,24 @@ class ScanCounts:
             round(sigma, 4) if math.isfinite(sigma) else None,
             dict(sorted((verdict.label, n) for verdict, n in zip(Verdict, totals, strict=False) if n)),
             {reason: n for reason, n in losses.items() if n},
-            warning_texts(Counter(warnings) + self._warned[index])[:_MOST_WARNINGS],
+            warning_texts(Counter(warnings) + self._warnings_until(index))[:_MOST_WARNINGS],
         )
+
+    def _warnings_until(self, index: int) -> Counter[str]:
+        """Return the numbers of the warnings up to a scan. They are counted on from the last call, as a run
+        mostly goes forward."""
+        end = bisect_right(self._warned, index, key=_scan_of)
+        if end < self._counted:
+            self._counted, self._warnings = 0, Counter()
+        for _, texts in self._warned[self._counted : end]:
+            self._warnings.update(texts)
+        self._counted = end
+        return self._warnings
+
+
+def _scan_of(warned: tuple[int, tuple[str, ...]]) -> int:
+    """Return the index of a scan with warnings."""
+    return warned[0]
 
 
 _WIDTH = 11  # scan, number, observations, time, x, y, var x, cov xy, var y, DBH, its sigma

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -51,3 +52,23 @@ def test_a_scan_takes_88_bytes() -> None:
     each = 4 * (len(Verdict) + 3) + 8  # numbers by verdict and pose quality, sigma
     assert each == 88
     assert sum(column.nbytes for column in counts._rows._columns) <= 2 * each * scans  # the capacity doubles
+
+
+def test_warnings_take_memory_for_each_scan_that_has_them() -> None:
+    """Texts with numbers differ from scan to scan, such as those of jumps of the odometry."""
+    counts, scans = ScanCounts(), 1000
+    frames = [scan(index, warnings=(f"it jumped by {index} m",)) for index in range(scans)]
+    tracemalloc.start()
+    try:
+        for frame in frames:
+            counts.record(frame)
+            told = counts.totals(frame.index, [], {}).warnings
+        taken, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert told[:2] == ["it jumped by 0 m", "it jumped by 1 m"]
+    assert taken < 1000 * scans
+    counts.forget_from(2)
+    counts.record(scan(2, warnings=("it jumped by 0 m",)))
+    assert counts.totals(2, [], {}).warnings == ["it jumped by 0 m (2 times)", "it jumped by 1 m"]
+    assert counts.totals(0, [], {}).warnings == ["it jumped by 0 m"]
