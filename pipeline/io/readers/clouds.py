@@ -184,13 +184,14 @@ def _open_las(path: Path) -> PointTable:
         ScanFileError: The header is damaged, contradicts itself or the file, or names too many points.
         OSError: The file cannot be read.
     """
-    points, there, compressed, version = _check_las(path)
-    with errors_as_damage("the LAS file is damaged"), _las_reader(path) as reader:
-        header = reader.header
-        scales, offsets = header.scales.copy(), header.offsets.copy()
-        crs, system = _crs_of(header), str(header.system_identifier).rstrip("\0")
-        dimensions = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
-        low, high = (np.array(corner, np.float64) for corner in (header.mins, header.maxs))
+    with errors_as_damage("the LAS file is damaged"):
+        points, there, compressed, version = _check_las(path)
+        with _las_reader(path) as reader:
+            header = reader.header
+            scales, offsets = header.scales.copy(), header.offsets.copy()
+            crs, system = _crs_of(header), str(header.system_identifier).rstrip("\0")
+            dimensions = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
+            low, high = (np.array(corner, np.float64) for corner in (header.mins, header.maxs))
 
     def read() -> Iterator[Columns]:
         """Yield the coordinates of the points that the file can hold, float64 [m]."""

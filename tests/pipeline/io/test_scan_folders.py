@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -161,6 +162,20 @@ def test_a_damaged_scan_is_counted_and_the_others_are_read(tmp_path: Path, opene
         write(tmp_path / f"{k}.laz", k)
     whole = (tmp_path / "1.laz").read_bytes()
     (tmp_path / "1.laz").write_bytes(whole[:100])
+    source = opened(tmp_path)
+    assert sum(isinstance(record, Scan) for record in source.records()) == 2
+    assert source.losses == {"scan files that cannot be read": 1}
+
+
+def test_a_chunk_table_of_a_scan_that_promises_more_than_the_file_has_is_damage(tmp_path: Path, opened: Opened):
+    for k in range(3):
+        las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
+        las.x, las.y, las.z = points(k).T
+        las.write(str(tmp_path / f"{k}.laz"))
+    whole = bytearray((tmp_path / "1.laz").read_bytes())
+    (table,) = struct.unpack_from("<q", whole, *struct.unpack_from("<I", whole, 96))  # offset of the points
+    struct.pack_into("<I", whole, table + 4, 1000)  # chunks
+    (tmp_path / "1.laz").write_bytes(whole)
     source = opened(tmp_path)
     assert sum(isinstance(record, Scan) for record in source.records()) == 2
     assert source.losses == {"scan files that cannot be read": 1}
