@@ -10,6 +10,7 @@ import msgspec
 
 from app.common.child_process import (
     BlockingChildProcess,
+    ChildError,
     ParentConnection,
     ProtocolError,
     python_module,
@@ -85,7 +86,7 @@ def draw_safely(drawing: Drawing) -> bytes | None:
     try:
         child.send(drawing)
         return child.receive(bytes, _PATIENCE_S)
-    except ProtocolError:
+    except (ChildError, ProtocolError):
         return None
     finally:
         child.end()

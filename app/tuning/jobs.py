@@ -22,7 +22,13 @@ import msgspec
 
 import pipeline
 from app.batch.summary import far_truth
-from app.common.child_process import BlockingChildProcess, ProtocolError, exit_reason, python_module
+from app.common.child_process import (
+    BlockingChildProcess,
+    ChildError,
+    ProtocolError,
+    exit_reason,
+    python_module,
+)
 from app.common.text import count, version
 from app.robot.address import is_live
 from app.sources.request import SourceRequest
@@ -327,7 +333,7 @@ class ScoringProcesses(Generic[T]):
                 if result is not None:
                     return result
                 reason = exit_reason(child.end(1.0))
-            except ProtocolError as error:
+            except (ChildError, ProtocolError) as error:
                 child.end()
                 reason = error.what
             with self._lock:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -154,3 +155,9 @@ def test_what_is_no_picture_is_refused(picture: Drawing):
 def test_the_reason_why_a_picture_cannot_be_drawn_is_printed(capfd):
     assert draw_safely(drawing(b"no picture")) is None
     assert "UnidentifiedImageError" in capfd.readouterr().err
+
+
+def test_a_picture_for_which_there_is_too_little_memory_is_none(monkeypatch: pytest.MonkeyPatch):
+    failure = """print('!["this needs more memory than this machine has","",""]')"""
+    monkeypatch.setattr("app.common.draw_picture._COMMAND", (sys.executable, "-c", failure))
+    assert draw_safely(drawing(b"")) is None

@@ -137,6 +137,24 @@ def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_
     assert any("1 stored result could not be read" in warning for warning in kept.warnings())
 
 
+def test_a_process_that_ends_with_an_error_is_lost_and_the_other_jobs_go_on():
+    """Lack of memory, for example, reaches the parent as a line."""
+    code = """
+import sys
+for job in sys.stdin:
+    bad = '"eps":0.1' in job
+    print('!["out of memory","",""]' if bad else '{"scores":null,"error":"fine"}', flush=True)
+    if bad:
+        break
+"""
+    with closing(ScoringProcesses[int](1, (sys.executable, "-c", code))) as failing:
+        answers = sweep([job(0.1), job(0.2)], failing)
+    assert [answer.scores for answer in answers] == [None, None]
+    assert answers[0].error.endswith("the last one: out of memory")
+    assert answers[1].error == "fine"
+    assert failing.lost == {"out of memory": MOST_LOSSES}
+
+
 def test_where_nothing_can_be_written_the_results_come_all_the_same(tmp_path):
     (tmp_path / "file").touch()
     kept = ResultStore(tmp_path / "file")
