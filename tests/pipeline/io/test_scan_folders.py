@@ -167,7 +167,7 @@ def test_a_damaged_scan_is_counted_and_the_others_are_read(tmp_path: Path, opene
     assert source.losses == {"scan files that cannot be read": 1}
 
 
-def test_a_chunk_table_of_a_scan_that_promises_more_than_the_file_has_is_damage(tmp_path: Path, opened: Opened):
+def test_a_chunk_table_that_promises_more_than_the_file_has_is_damage(tmp_path: Path, opened: Opened):
     for k in range(3):
         las = laspy.LasData(laspy.LasHeader(point_format=6, version="1.4"))
         las.x, las.y, las.z = points(k).T
