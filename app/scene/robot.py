@@ -49,31 +49,33 @@ class RobotNodes:
             np.column_stack([particles[:, :2], np.full(len(particles), frame.base_z + 0.05)]),
             colours.PARTICLES,
         )
+        thin = _thinned(path)
         for line, layer, places in (
-            (self._path, "path", path[:, :2]),
-            (self._odometry, "odometry", aligned_odometry(path)),
+            (self._path, "path", thin[:, :2]),
+            (self._odometry, "odometry", aligned_odometry(path[: FIRST_SCANS + 1], thin)),
         ):
-            thin = _thinned(places)
-            line.show(view.layers[layer], thin, _stepped(ground, thin))
+            line.show(view.layers[layer], places, _stepped(ground, places))
 
 
-def aligned_odometry(path: Float) -> Float:
+def aligned_odometry(first: Float, path: Float) -> Float:
     """Return the known positions by odometry, shape (M, 2) [m], moved to the start of the path and turned to
-    its first direction, so that the drift since then is visible; as on the 2D map.
+    its first direction, so that the drift since then is visible; as on the 2D map. There are none if they are
+    unknown at all first scans.
 
     Args:
-        path: As in `Scene.show`.
+        first: The first rows of the path, which give its start and its first direction.
+        path: Rows of the path, as in `Scene.show`.
     """
-    path = path[np.isfinite(path[:, 2])]
-    if not len(path):
-        return path[:, 2:]
-    x, y, ahead, left = path[min(FIRST_SCANS, len(path) - 1)] - path[0]
+    first, path = (rows[np.isfinite(rows[:, 2])] for rows in (first, path))
+    if not len(first):
+        return np.zeros((0, 2))
+    x, y, ahead, left = first[-1] - first[0]
     turn = np.arctan2(y, x) - np.arctan2(left, ahead) if np.hypot(ahead, left) > FIRST_M else 0.0
-    return path[0, :2] + Pose2(0.0, 0.0, float(turn)).apply(path[:, 2:] - path[0, 2:])
+    return first[0, :2] + Pose2(0.0, 0.0, float(turn)).apply(path[:, 2:] - first[0, 2:])
 
 
 def _thinned(path: Float) -> Float:
-    """Return at most MOST_POINTS + 1 rows of a path, shape (N, 2) [m]: the rows at multiples of the smallest
+    """Return at most MOST_POINTS + 1 rows of a path, shape (N, 4) [m]: the rows at multiples of the smallest
     sufficient power of two, and the last row."""
     spacing = 1
     while len(path) > spacing * MOST_POINTS:

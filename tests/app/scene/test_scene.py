@@ -250,6 +250,24 @@ def test_the_path_by_odometry_begins_with_the_path_in_its_direction(scene: Scene
         np.testing.assert_allclose(segments[:, 1, :2], places[1:], atol=1e-5)
 
 
+def test_a_long_path_by_odometry_is_thinned_before_it_is_moved(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    """The path of a day has 864,000 rows, and it is drawn ten times a second."""
+    monkeypatch.setattr("app.scene.robot.MOST_POINTS", 100)
+    moved: list[int] = []
+    apply = Pose2.apply
+
+    def counted(pose: Pose2, places: np.ndarray) -> np.ndarray:
+        moved.append(len(places))
+        return apply(pose, places)
+
+    monkeypatch.setattr(Pose2, "apply", counted)
+    scene.choose("odometry", True)
+    scene.show(make_frame(999), PATH)
+    assert 64 in moved
+    assert len(PATH) not in moved
+    np.testing.assert_allclose(node(scene, "/world/odometry/0").points[0, :, 0], PATH[[0, 16], 0], atol=1e-6)
+
+
 def test_cameras_return_to_the_robot_after_a_large_cloud(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     camera = SimpleNamespace()
     client = SimpleNamespace(atomic=contextlib.nullcontext, camera=camera)
