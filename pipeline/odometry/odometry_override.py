@@ -108,11 +108,11 @@ class FileOdometry:
         try:
             self._times, self._poses = read_any_poses(path)
         except (TextError, OSError) as error:
-            reason = str(error) if isinstance(error, TextError) else error.strerror
+            reason = str(error) if isinstance(error, TextError) else error.strerror or str(error)
             raise SourceError(
                 f"no poses can be read: {reason}",
                 where=str(path),
-                remedy=f"Rows are {POSE_ROWS}.",
+                remedy="" if POSE_ROWS in reason else f"Rows are {POSE_ROWS}.",
             ) from None
         self._T_lidar_base = T_base_lidar.inverse()
         self._row_of: dict[int, int] = {}

@@ -17,6 +17,7 @@ from pipeline.io.readers.point_files import (
     MISSING,
     MOST_POINTS,
     PART,
+    REMEDY,
     Columns,
     PointTable,
     ScanFileError,
@@ -28,7 +29,6 @@ from pipeline.types.records import CloudDescription, Float, Float32
 if TYPE_CHECKING:
     import laspy
 
-_REMEDY = "Copy the file again, or export it again"
 _AXES = ("x", "y", "z")
 
 
@@ -42,7 +42,7 @@ def open_cloud(uri: str) -> PointCloud:
         path = Path(uri).expanduser()
         return PointCloud(uri, path, open_points(path))
     except ScanFileError as error:
-        raise SourceError(str(error), where=uri, remedy=_REMEDY) from None
+        raise SourceError(str(error), where=uri, remedy=error.remedy) from None
     except MemoryError:
         raise SourceError("it is too large for the memory of this machine", where=uri) from None
     except (OSError, ValueError, RuntimeError) as error:  # a path with a zero byte, an unknown home
@@ -145,9 +145,11 @@ class PointCloud:
                 if not good.all():
                     count_loss(self.losses, self._table.invalid, int(np.count_nonzero(~good)))
                 yield xyz[good].astype(np.float32)
-        except (OSError, ScanFileError) as error:
-            what = f"cannot read: {error.strerror or error}" if isinstance(error, OSError) else str(error)
-            raise SourceError(what, where=self.description.uri, remedy=_REMEDY) from None
+        except OSError as error:
+            what = f"cannot read: {error.strerror or error}"
+            raise SourceError(what, where=self.description.uri, remedy=REMEDY) from None
+        except ScanFileError as error:
+            raise SourceError(str(error), where=self.description.uri, remedy=error.remedy) from None
         if read < self.description.points:
             count_loss(self.losses, MISSING, self.description.points - read)
 
@@ -401,7 +403,7 @@ def _open_e57(path: Path) -> PointTable:
     try:
         from pye57 import E57
     except ImportError:
-        raise ScanFileError("E57 files need pye57; install it with: uv sync --extra e57") from None
+        raise ScanFileError("E57 files need pye57", "Install it with: uv sync --extra e57") from None
     with errors_as_damage("the E57 file is damaged"), closing(E57(str(path))) as file:
         stations = int(file.scan_count)
         if stations > MOST_STATIONS:

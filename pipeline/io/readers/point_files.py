@@ -44,8 +44,20 @@ _MOST_FIELDS = 1000
 _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, struct.error)
 
 
+REMEDY = "Copy the file again, or export it again"  # of a damaged file
+
+
 class ScanFileError(Exception):
-    """A file does not hold a scan or a cloud; the message gives the reason."""
+    """A file does not hold a scan or a cloud.
+
+    Args:
+        what: The reason, the message of the error.
+        remedy: What a person can do, one sentence.
+    """
+
+    def __init__(self, what: str, remedy: str = REMEDY) -> None:
+        self.remedy = remedy
+        super().__init__(what)
 
 
 @contextmanager

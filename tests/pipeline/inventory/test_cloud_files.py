@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import struct
+import sys
 import zipfile
 from contextlib import suppress
 from pathlib import Path
@@ -84,6 +85,13 @@ def test_a_cloud_that_cannot_be_read_any_more_is_an_error_of_the_cloud(tmp_path,
     with pytest.raises(SourceError, match="cannot read: No such file") as refusal:
         list(cloud.parts())
     assert refusal.value.where == str(file)
+
+
+def test_a_package_that_is_missing_is_to_be_installed(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pye57", None)
+    (tmp_path / "c.e57").write_bytes(b"ASTM-E57")
+    with pytest.raises(SourceError, match=r"E57 files need pye57 .*\. Install it with: uv sync --extra e57$"):
+        open_cloud(str(tmp_path / "c.e57"))
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -137,6 +137,10 @@ def test_poses_from_a_file_are_told_at_the_scans(tmp_path: Path):
     assert "+" in source.description.digest
     with pytest.raises(SourceError, match="no poses can be read"):
         with_odometry(open_source(str(tmp_path / "scans")), f"file:{tmp_path / 'none.txt'}")
+    (tmp_path / "way.txt").write_text("1 2 3\n")
+    with pytest.raises(SourceError, match="3 columns; readable are t x y z") as refusal:
+        with_odometry(open_source(str(tmp_path / "scans")), f"file:{tmp_path / 'way.txt'}")
+    assert str(refusal.value).count("t x y z") == 1
 
 
 @pytest.mark.parametrize("lost", [None, 2])
