@@ -62,11 +62,11 @@ def test_warnings_take_memory_for_each_scan_that_has_them() -> None:
     try:
         for frame in frames:
             counts.record(frame)
-            told = counts.totals(frame.index, [], {}).warnings
+            counts.totals(frame.index, [], {})
         taken, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
-    assert told[:2] == ["it jumped by 0 m", "it jumped by 1 m"]
+    assert counts.totals(1, [], {}).warnings == ["it jumped by 0 m", "it jumped by 1 m"]
     assert taken < 1000 * scans
     counts.forget_from(2)
     counts.record(scan(2, warnings=("it jumped by 0 m",)))
