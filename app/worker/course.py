@@ -174,7 +174,10 @@ class ScanCounts:
         self._counted, self._warnings = 0, Counter[str]()  # so many of them, and their warnings
 
     def record(self, frame: Frame) -> None:
-        """Add the scan after the last one; any other scan is ignored, also one that is mapped again."""
+        """Add the scan after the last one, or replace the last one; any other scan is ignored, also one that
+        is mapped again."""
+        if frame.index == len(self._rows) - 1:
+            self.forget_from(frame.index)
         known, sigma = len(self._rows), frame.health.sigma_xy
         if frame.index != known:
             return

@@ -256,13 +256,13 @@ class RunMap:
 
     def use(self, parameters: Parameters, index: int) -> bool:
         """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
-        value changes. If so, the states after that scan are dropped, and the frames and the course of this
-        scan and of later ones."""
+        value changes. If so, the states after that scan are dropped, the frames and the course of this scan
+        and of later ones, and the counts of later ones."""
         changes = self.parameters.set_from(index, parameters)
         if changes:
             self.snapshots.forget_after(index)
             self.course.forget_from(index)
-            self.counts.forget_from(index)
+            self.counts.forget_from(index + 1)  # those of this scan are known until it is mapped again
             if self.frames is not None:
                 self.frames.forget_from(index)
         return changes

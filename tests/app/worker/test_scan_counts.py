@@ -38,6 +38,9 @@ def test_scans_count_once_until_they_are_forgotten() -> None:
     counts.record(scan(1, Verdict.BUSH))  # mapped again
     counts.record(scan(9, Verdict.WALL))  # beyond the next one
     assert counts.totals(3, [], {}).verdicts == {"tree": 4}
+    counts.record(scan(3, Verdict.BUSH))  # the last one, mapped again
+    assert counts.totals(3, [], {}).verdicts == {"bush": 1, "tree": 3}
+    assert counts.totals(3, [], {}).warnings == ["slow (3 times)"]
     counts.forget_from(1)
     counts.record(scan(1, Verdict.BUSH, Verdict.BUSH))
     assert counts.totals(0, [], {}).verdicts == {"tree": 1}

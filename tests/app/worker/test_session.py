@@ -325,6 +325,22 @@ def test_a_failing_source_says_so_and_what_came_before_can_be_seen() -> None:
         settle(session)
 
 
+def test_counts_of_the_last_scan_are_known_while_it_waits_for_other_parameters() -> None:
+    """After a failure the scan is not mapped again, but it can still be shown."""
+    session = opened(fails_at=7)
+    session.play()
+    for _ in range(7):
+        session.work()
+    session.fail("the file ends here (scan 7)")
+    assert session.set_parameters(parameters(0.6), 1) is None
+    session.seek(0.6)
+    shown = settle(session)
+    assert shown is not None
+    assert shown.index == 6
+    assert session.counts is not None
+    assert sum(session.counts.health.values()) == 7
+
+
 def test_a_fault_in_the_mapper_is_survived_by_playing_anew() -> None:
     session = opened()
     session.advance(10)
