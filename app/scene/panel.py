@@ -23,7 +23,7 @@ CHANGED = "● "
 MAIN = tuple(spec for spec in field_specs() if spec.main)
 
 #: Calls a function with arguments on the loop of the server.
-Cross = Callable[..., None]
+LoopCaller = Callable[..., None]
 
 
 class TunePanel:
@@ -43,7 +43,7 @@ class TunePanel:
         parameters: Parameters,
         preset_name: str,
         tuning: PanelCommands,
-        cross: Cross,
+        cross: LoopCaller,
     ) -> None:
         self._tuning, self._cross = tuning, cross
         self._widgets: dict[str, viser.GuiSliderHandle[Any]] = {}
