@@ -82,7 +82,7 @@ class RosSource(MessageSource):
         self._wanted = self._moving.union(*named)
         self._truth, sensor = self._read_truth()
         first, frame, product = self._first_scan()
-        sensor = sensor or SENSORS.get(product) or sensor_of(first)
+        sensor = sensor or sensor_of(first, SENSORS.get(product))
         self._top_ring = sensor.rings - 1 if rings_descend(first) else None
         described = self._describe(first, frame, sensor, digest_of(paths), options)
         self._records.poses = topics.numbers("pose")

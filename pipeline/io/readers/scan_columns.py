@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,20 +172,62 @@ def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
 #: Fewest points of a ring for its elevation.
 _RING_POINTS = 8
 VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.03, 100.0)
+#: Bounds of a measured range sigma [m]: the roughness of bark, which exceeds the noise of a better sensor,
+#: and the accuracy of a VLP-16 by its data sheet, which rough ground may exceed.
+RANGE_SIGMA_LEAST, RANGE_SIGMA_MOST = 0.01, 0.03
+#: Number of places at which the range sigma is measured, and points at each: few, so that they are on one
+#: surface, with nine degrees of freedom beside the plane.
+_PLACES, _NEIGHBOURS = 1000, 12
+_FEWEST = 100  # points of a scan
 
 
-def sensor_of(scan: Scan) -> Sensor:
+def sensor_of(scan: Scan, known: Sensor | None = None) -> Sensor:
     """Infer the sensor from a scan: number of rings (the highest ring number + 1), their step in elevation,
-    and the step in azimuth; the range sigma is 0.03 m.
+    the step in azimuth, and the range sigma (`measured_range_sigma`).
 
     If the scan has no ring numbers, it is a VLP-16 if the elevations are those of this sensor, else `rings`
     is 0. For fewer than 100 points `rings` is 0 too. An unknown azimuth step is that of `Sensor`, an unknown
     ring step 0.
+
+    Args:
+        scan: The scan.
+        known: The sensor, if it is known except for its range sigma.
     """
-    if len(scan.points) < 100:
-        return Sensor(range_sigma=0.03)
+    return replace(known or _beams_of(scan), range_sigma=measured_range_sigma(scan))
+
+
+def measured_range_sigma(scan: Scan) -> float:
+    """Return the standard deviation of a range [m], from RANGE_SIGMA_LEAST to RANGE_SIGMA_MOST; the latter
+    for fewer than 100 points.
+
+    On a plane n p = d, the inverse range of a beam u is linear in u: 1/r = n u / d. This is fitted to the
+    returns of neighbouring beams at places all over the scan, whatever the pattern of the sensor. The
+    residuals show the noise on ground and stems, and more on leaves and at edges, so the lower quartile of
+    the places is taken: 0.87 to 1.09 times the true value in simulated stands, with few or many leaves.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(scan.points) < _FEWEST:
+        return RANGE_SIGMA_MOST
+    points = scan.points.astype(np.float64)
+    reach = np.linalg.norm(points, axis=1)
+    beam = points / reach[:, None]
+    places = np.linspace(0, len(points) - 1, min(_PLACES, len(points))).astype(np.int64)
+    _, near = cKDTree(beam).query(beam[places], _NEIGHBOURS)
+    inverse = 1.0 / reach[near][:, :, None]
+    space = np.linalg.svd(beam[near], full_matrices=False)[0]
+    residual = (inverse - space @ (space.transpose(0, 2, 1) @ inverse))[:, :, 0]
+    variance = np.sum(residual**2, axis=1) / (_NEIGHBOURS - 3)
+    sigma = float(np.quantile(np.sqrt(variance) * reach[places] ** 2, 0.25))
+    return float(np.clip(sigma, RANGE_SIGMA_LEAST, RANGE_SIGMA_MOST))
+
+
+def _beams_of(scan: Scan) -> Sensor:
+    """Return the sensor of a scan as `sensor_of` does; its range sigma has no meaning."""
+    if len(scan.points) < _FEWEST:
+        return Sensor()
     if scan.ring is None:
-        return VLP_16 if _in_steps_of_vlp_16(scan) else Sensor(range_sigma=0.03)
+        return VLP_16 if _in_steps_of_vlp_16(scan) else Sensor()
     rings = int(scan.ring.max()) + 1
     elevation = _elevations(scan)
     steps = np.abs(np.diff(elevation[np.isfinite(elevation)]))
@@ -197,9 +240,7 @@ def sensor_of(scan: Scan) -> Sensor:
         64: "64-ring LiDAR",
         128: "128-ring LiDAR",
     }
-    return Sensor(
-        name.get(rings, "LiDAR"), rings, ring_step, azimuth_step or Sensor().azimuth_step, range_sigma=0.03
-    )
+    return Sensor(name.get(rings, "LiDAR"), rings, ring_step, azimuth_step or Sensor().azimuth_step)
 
 
 def _in_steps_of_vlp_16(scan: Scan) -> bool:

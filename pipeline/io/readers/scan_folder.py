@@ -330,7 +330,7 @@ def _kitti_sensor(scan: Scan) -> Sensor:
     low, high = np.percentile(elevation, [0.5, 99.5])
     sectors = len(np.unique(np.floor(np.arctan2(points[:, 1], points[:, 0]) / np.radians(10.0))))
     dense = len(points) > 50_000 and sectors >= 30
-    return HDL_64 if dense and -27.0 < low < -20.0 and 1.0 < high < 6.0 else sensor_of(scan)
+    return sensor_of(scan, HDL_64 if dense and -27.0 < low < -20.0 and 1.0 < high < 6.0 else None)
 
 
 #: Name, function that reads a file, and function that infers the LiDAR from the first scan, by suffix.
