@@ -28,10 +28,13 @@ from pipeline.io.readers.scan_columns import rings_descend, sensor_of
 from pipeline.io.readers.topics import LASER_SCAN, choose_topics
 from pipeline.io.readers.transforms import Extrinsics, TransformTree, frame_name
 from pipeline.io.readers.velodyne import SENSORS
-from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
+from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor, Truth
 
 #: Number of unreadable scans at the start after which the recording is refused.
 _TRIES = 20
+#: Cosine of the tilt of a robot above which an IMU has other axes: these differ by 90 or 180 degrees, and no
+#: robot stands on a slope of half of that.
+_UPRIGHT = np.cos(np.radians(45.0))
 
 
 class RosSource(MessageSource):
@@ -277,6 +280,16 @@ class RosSource(MessageSource):
                 return ""
         return ""
 
+    def _is_upright(self) -> bool:
+        """Return whether the first orientation of the IMU among its first _TRIES messages is that of a robot
+        that stands (_UPRIGHT); True if there is none."""
+        numbers = self._topics.numbers("imu")
+        for message in islice(self._container.messages(numbers, None, {}), _TRIES if numbers else 0):
+            reading = self._records.record(message, 0, {})
+            if isinstance(reading, Imu) and reading.orientation is not None:
+                return bool(Pose3.from_quaternion(np.zeros(3), reading.orientation).R[2, 2] > _UPRIGHT)
+        return True
+
     def _describe(
         self, first: Scan, frame: str, sensor: Sensor, digest: str, options: SourceOptions
     ) -> SourceDescription:
@@ -299,6 +312,12 @@ class RosSource(MessageSource):
             warnings.append(
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "
                 "the LiDAR is assumed to be at the base"
+            )
+        self._records.levels = self._is_upright()
+        if not self._records.levels:
+            warnings.append(
+                f"by the orientation in {chosen['imu'].name} the robot would lie on its side or back: it is not "
+                f"used (no fixed transform to {base or 'the base'}, or an IMU whose z axis points down)"
             )
         unnamed = {channel.topic for channel in self._channels.values() if not channel.encoding}
         read = [topic.name for topic in self._topics.recorded() if topic.read_as and topic.name in unnamed]

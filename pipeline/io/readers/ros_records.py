@@ -167,6 +167,7 @@ class RecordDecoder:
         frames: Dict from the roles "gnss" and "pose" to the frames of their measurements, GnssFrame and
             OtherFrame. Readings of a role that is missing are not used.
         poses: Numbers of the channels with poses of another SLAM.
+        levels: Whether the orientations of the IMU are used.
     """
 
     def __init__(self, channels: Mapping[int, Channel], tree: TransformTree) -> None:
@@ -176,6 +177,7 @@ class RecordDecoder:
         self.base = ""
         self.frames: dict[str, GnssFrame | OtherFrame] = {}
         self.poses = frozenset[int]()
+        self.levels = True
 
     def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
         """Return the record in a message; None if it cannot be used.
@@ -336,7 +338,7 @@ class RecordDecoder:
 
     def _imu(self, message: Message, stamp_ns: int) -> Imu:
         """Decode an IMU reading, rotated into the base frame if the pose of the IMU is known. Its orientation
-        is None if the message has none.
+        is None if the message has none, or if orientations are not used.
 
         Raises:
             ValueError: A number is not finite, or a rate or an acceleration is 1e6 or more.
@@ -351,7 +353,7 @@ class RecordDecoder:
             raise ValueError("the reading is not finite")
         # REP 145: a first covariance of -1 means no orientation; some drivers send a zero quaternion instead.
         orientation = None
-        if decoded.orientation_covariance[0] >= 0 and abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) > 0.1:
+        if self.levels and decoded.orientation_covariance[0] >= 0 and abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) > 0.1:
             R_level_imu = Pose3.from_quaternion(np.zeros(3), [q.w, q.x, q.y, q.z]).R
             orientation = Pose3(R_level_imu @ R_base_imu.T, np.zeros(3)).quaternion()
         return Imu(stamp_ns, rates[0], rates[1], orientation)
