@@ -23,6 +23,7 @@ from pipeline.io.readers.message_time import (
     header_stamp,
     in_order_of_stamps,
 )
+from pipeline.io.readers.mounting import mounting_by_ground
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
 from pipeline.io.readers.topics import LASER_SCAN, choose_topics
@@ -301,14 +302,24 @@ class RosSource(MessageSource):
             frame: Name of the frame of the first scan.
             sensor: The LiDAR.
             digest: Digest of the files.
-            options: Extrinsics chosen by the user; without them, those of the transforms, else identity.
+            options: Extrinsics chosen by the user; without them, those of the transforms, else those by the
+                ground (`mounting_by_ground`), else identity.
         """
         chosen = self._topics.chosen
         self._records.base = self.base = base = self._extrinsics.base_frame(self._odometry_base())
         has_odometry = "odometry" in chosen or bool(self._moving)
-        linked = options.T_base_lidar or self._extrinsics.tree.find(base, frame)
+        # A frame without a name has no place on the robot, not even that of a base without a name.
+        linked = options.T_base_lidar or (self._extrinsics.tree.find(base, frame) if frame else None)
         warnings = self._warnings
-        if linked is None and has_odometry and base != frame:
+        if linked is None and (linked := mounting_by_ground(first)) is not None:
+            self._extrinsics.tree.add(base, frame, linked)  # also for an IMU in the same housing
+            tilt = np.degrees(np.arccos(np.clip(linked.R[2, 2], -1.0, 1.0)))
+            warnings.append(
+                f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: by the ground in "
+                f"the first scan, the LiDAR is tilted by {tilt:.0f} degrees and {linked.t[2]:.1f} m high; "
+                "--mount overrides this"
+            )
+        elif linked is None and has_odometry and base != frame:
             warnings.append(
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "
                 "the LiDAR is assumed to be at the base"
@@ -316,8 +327,8 @@ class RosSource(MessageSource):
         self._records.levels = self._is_upright()
         if not self._records.levels:
             warnings.append(
-                f"by the orientation in {chosen['imu'].name} the robot would lie on its side or back: it is not "
-                f"used (no fixed transform to {base or 'the base'}, or an IMU whose z axis points down)"
+                f"by the orientation in {chosen['imu'].name} the robot would lie on its side or back: it is "
+                f"not used (no fixed transform to {base or 'the base'}, or an IMU whose z axis points down)"
             )
         unnamed = {channel.topic for channel in self._channels.values() if not channel.encoding}
         read = [topic.name for topic in self._topics.recorded() if topic.read_as and topic.name in unnamed]

@@ -353,7 +353,11 @@ class RecordDecoder:
             raise ValueError("the reading is not finite")
         # REP 145: a first covariance of -1 means no orientation; some drivers send a zero quaternion instead.
         orientation = None
-        if self.levels and decoded.orientation_covariance[0] >= 0 and abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) > 0.1:
+        if (
+            self.levels
+            and decoded.orientation_covariance[0] >= 0
+            and abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) > 0.1
+        ):
             R_level_imu = Pose3.from_quaternion(np.zeros(3), [q.w, q.x, q.y, q.z]).R
             orientation = Pose3(R_level_imu @ R_base_imu.T, np.zeros(3)).quaternion()
         return Imu(stamp_ns, rates[0], rates[1], orientation)
