@@ -108,10 +108,14 @@ def test_a_press_on_a_slider_changes_nothing_and_a_drag_is_one_step(dashboard: D
     dashboard.until_scene_is_named()
     before = dashboard.ask("/api/parameters")
     main = [spec for spec in before["specs"] if spec["main"]]
+    of_kind = {(spec["kind"], spec["log"]): (k, spec) for k, spec in reversed(list(enumerate(main)))}
+    assert (
+        len(of_kind) >= 3
+    )  # whole numbers, and linear and logarithmic scales; all sliders of a kind are alike
     frame = page.locator("#scene").bounding_box()
     assert frame is not None
     steps = before["undo"]
-    for k, spec in enumerate(main):
+    for turn, (k, spec) in enumerate(of_kind.values()):
         scene.locator(".mantine-Slider-root").nth(k).scroll_into_view_if_needed()
         label, x, y = scene.evaluate(SLIDERS)[k]
         assert label.startswith(spec["title"])
@@ -126,7 +130,7 @@ def test_a_press_on_a_slider_changes_nothing_and_a_drag_is_one_step(dashboard: D
         page.mouse.down()
         for travelled in range(1, 13):
             page.mouse.move(frame["x"] + x + 3 + towards * travelled, frame["y"] + y)
-            if travelled == 6 and k == 0:
+            if travelled == 6 and turn == 0:
                 page.wait_for_timeout(2000)  # a person looks at the scene
         page.mouse.up()
         dashboard.until_server("/api/parameters", f"it.values['{spec['name']}'] !== {value}")
