@@ -306,7 +306,8 @@ class RosSource(MessageSource):
                 ground (`mounting_by_ground`), else identity.
         """
         chosen = self._topics.chosen
-        self._records.base = self.base = base = self._extrinsics.base_frame(self._odometry_base())
+        of_odometry = self._odometry_base()
+        self._records.base = self.base = base = self._extrinsics.base_frame(of_odometry, frame)
         has_odometry = "odometry" in chosen or bool(self._moving)
         # A frame without a name has no place on the robot, not even that of a base without a name.
         linked = options.T_base_lidar or (self._extrinsics.tree.find(base, frame) if frame else None)
@@ -323,6 +324,10 @@ class RosSource(MessageSource):
             warnings.append(
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "
                 "the LiDAR is assumed to be at the base"
+            )
+        if of_odometry and self._extrinsics.tree.find(of_odometry, base) is None:
+            warnings.append(
+                f"no fixed transform from {of_odometry} to {base}: both are taken as the same frame"
             )
         self._records.levels = self._is_upright()
         if not self._records.levels:

@@ -120,15 +120,20 @@ class Extrinsics:
         for (parent, child), pose in self._links(fixed, FIXED_MESSAGES, steady=False).items():
             self.tree.add(parent, child, pose)
 
-    def base_frame(self, by_odometry: str) -> str:
-        """Return the base frame: `by_odometry` if it is not "", else the child of the moving transform of the
-        odometry, else the first of "base_link", "base_footprint" and "base" that `tree` knows, else ""."""
-        if by_odometry:
-            return by_odometry
-        if self.odometry_link is not None:
-            return self.odometry_link[1]
-        usual = ("base_link", "base_footprint", "base")
-        return next((name for name in usual if self.tree.knows(name)), "")
+    def base_frame(self, by_odometry: str, lidar: str) -> str:
+        """Return the base frame: the first one with a fixed transform to the LiDAR, or else the first one, of
+        these: `by_odometry`, the child of the moving transform of the odometry, and those of "base_link",
+        "base_footprint" and "base" that `tree` knows. Names that are "" are skipped; "" if none is left.
+
+        Args:
+            by_odometry: Frame of the robot in the messages of the odometry.
+            lidar: Frame of the LiDAR.
+        """
+        moving = "" if self.odometry_link is None else self.odometry_link[1]
+        usual = [name for name in ("base_link", "base_footprint", "base") if self.tree.knows(name)]
+        names = [name for name in (by_odometry, moving, *usual) if name]
+        linked = (name for name in names if lidar and self.tree.find(name, lidar) is not None)
+        return next(linked, next(iter(names), ""))
 
     def _links(self, numbers: frozenset[int], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
         """Return a dict from (parent, child) to the first pose T_parent_child in the first messages of some

@@ -73,15 +73,15 @@ class Author:
         turn = self.make("Quaternion", 0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
         return self.make("Vector3", x, y, z), turn
 
-    def odometry(self, stamp_ns: int, x: float, yaw: float) -> Any:
-        """A nav_msgs/Odometry from odom to base_link."""
+    def odometry(self, stamp_ns: int, x: float, yaw: float, child: str = "base_link") -> Any:
+        """A nav_msgs/Odometry from odom to a frame of the robot."""
         zero, (at, turn) = np.zeros(36), self.pose(x, 0.0, 0.0, yaw)
         pose = self.make(
             "PoseWithCovariance", self.make("Pose", self.make("Point", at.x, at.y, at.z), turn), zero
         )
         still = self.make("Vector3", 0.0, 0.0, 0.0)
         twist = self.make("TwistWithCovariance", self.make("Twist", still, still), zero)
-        return self.make("Odometry", self.header(stamp_ns, "odom"), "base_link", pose, twist)
+        return self.make("Odometry", self.header(stamp_ns, "odom"), child, pose, twist)
 
     def imu(self, stamp_ns: int, rate: tuple[float, float, float], *, oriented: bool = True) -> Any:
         """A sensor_msgs/Imu in the frame imu_link."""

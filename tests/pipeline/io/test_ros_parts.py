@@ -166,6 +166,27 @@ def test_without_a_transform_the_mounting_is_taken_as_none_and_said(tmp_path: Pa
     )
 
 
+@pytest.mark.parametrize("child", ["vehicle", "robot1/base_link"])
+def test_odometry_of_an_unknown_frame_is_that_of_the_base_to_which_the_lidar_is_mounted(
+    child: str, tmp_path: Path, opened: Opened
+):
+    def other(author, write):
+        mounting = author.transforms(START_NS, ("base_link", "velodyne", (0.5, 0.0, 1.0, 0.0)))
+        write("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, mounting)
+        for k in range(2):
+            stamp_ns = START_NS + k * STEP_NS
+            write("/odom", "nav_msgs/msg/Odometry", stamp_ns, author.odometry(stamp_ns, 0.1 * k, 0.0, child))
+            write("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, author.cloud(stamp_ns, points_of(k)))
+
+    source = opened(write_recording("mcap", tmp_path, other))
+    np.testing.assert_allclose(source.description.T_base_lidar.t, (0.5, 0.0, 1.0))
+    assert source.description.warnings == (
+        f"no fixed transform from {child} to base_link: both are taken as the same frame",
+    )
+    odometry = [record for record in source.records() if isinstance(record, Odometry)]
+    assert odometry[-1].T_odom_base.t[0] == pytest.approx(0.1)
+
+
 def test_transforms_of_the_odometry_that_cannot_be_read_are_counted(tmp_path: Path, opened: Opened):
     path, kind = tmp_path / "run.mcap", "tf2_msgs/msg/TFMessage"
     author = Author("mcap")
