@@ -5,6 +5,7 @@ This module needs no compiled kernel, so that a URI is parsed quickly.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 from urllib.parse import parse_qsl
@@ -271,6 +272,7 @@ _OPTIONS: dict[str, tuple[Any, str]] = {
     "file": (str, "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd"),
     "truth": (str, "a table (CSV) of its trees in the coordinates of the cloud"),
 }
+_NUMBER = re.compile(r"[-+.0-9eE]+")
 _KEYS = ("seed", "sigma", "odometry", "duration", "trees", "drive")
 _CLOUD_KEYS = ("file", "truth", "seed", "sigma", "odometry", "duration")
 
@@ -385,9 +387,14 @@ def _values(uri: str, query: str, keys: tuple[str, ...]) -> dict[str, Any]:
 
 def _value(uri: str, key: str, text: str) -> Any:  # noqa: ANN401 - of the type of the option
     """Return the value of an option; UsageError if the text has another type or is out of bounds."""
+    declared = _OPTIONS[key][0]
+    kind = getattr(declared, "__origin__", str)
+    # Python alone would also take 1_0, spaces and digits of other scripts.
+    if kind is not str and not _NUMBER.fullmatch(text):
+        raise _refusal(uri, key, text)
     try:
-        return msgspec.convert(text, _OPTIONS[key][0], strict=False)
-    except msgspec.ValidationError:
+        return msgspec.convert(kind(text), declared)
+    except (ValueError, msgspec.ValidationError):
         raise _refusal(uri, key, text) from None
 
 

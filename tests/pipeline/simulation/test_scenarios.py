@@ -36,6 +36,8 @@ def test_every_option_is_taken_and_the_seed_of_the_uri_wins():
         ("sim:stand?seed=9223372036854775808", "seed"),
         ("sim:stand?seed=" + "9" * 5000, "seed"),
         ("sim:stand?seed=²", "seed"),
+        ("sim:stand?seed=1_0", "seed"),
+        ("sim:stand?trees=1e2", "trees"),
         ("sim:stand?sigma=nan", "sigma"),
         ("sim:stand?sigma=inf", "sigma"),
         ("sim:stand?sigma=-0.01", "sigma"),
@@ -57,6 +59,11 @@ def test_what_does_not_fit_is_refused_in_one_line(uri, message):
     with pytest.raises(SourceError, match=message) as refusal:
         parse_uri(uri)
     assert "\n" not in str(refusal.value)
+
+
+def test_numbers_as_in_stored_addresses_are_read():
+    request = parse_uri("sim:stand?seed=007&sigma=.05&duration=3e1")
+    assert (request.seed, request.sigma, request.duration_s) == (7, 0.05, 30.0)
 
 
 def test_a_seed_from_outside_is_checked_too():
