@@ -460,7 +460,7 @@ def compilation_notice() -> Iterator[None]:
         if reported_at:
             if now < reported_at[-1] + COMPILATION_S or (share := compiled_share()) == 1.0:
                 return  # the last kernels are those of one kind of source, which the share does not count
-            text = f"{100.0 * share:.0f} % of the kernels are compiled"
+            text = f"{int(100.0 * share)} % of the kernels are compiled"
         reported_at.append(now)
         tqdm.write(text, file=sys.stderr)
         sys.stderr.flush()

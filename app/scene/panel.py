@@ -34,7 +34,7 @@ class TunePanel:
         gui: Panel of viser, at the place of the new widgets.
         parameters, preset_name: Initial values.
         tuning: Sends the commands.
-        cross: Called in the thread of viser to use `tuning` on the loop of the server.
+        call_on_loop: Called in the thread of viser to use `tuning` on the loop of the server.
     """
 
     def __init__(
@@ -43,9 +43,9 @@ class TunePanel:
         parameters: Parameters,
         preset_name: str,
         tuning: PanelCommands,
-        cross: LoopCaller,
+        call_on_loop: LoopCaller,
     ) -> None:
-        self._tuning, self._cross = tuning, cross
+        self._tuning, self._call_on_loop = tuning, call_on_loop
         self._widgets: dict[str, viser.GuiSliderHandle[Any]] = {}
         self._folders: list[viser.GuiFolderHandle] = []
         self._preset = gui.add_dropdown(
@@ -57,13 +57,13 @@ class TunePanel:
         @self._reset.on_click
         async def _(event: viser.GuiEvent[Any]) -> None:
             if (client := event.client) is not None:
-                cross(lambda: tuning.ask(tuning.commands.reset_parameters([]), client))
+                call_on_loop(lambda: tuning.ask(tuning.commands.reset_parameters([]), client))
 
         @self._preset.on_update
         async def _(event: viser.GuiEvent[Any]) -> None:
             if (client := event.client) is not None:
                 name = event.target.value
-                cross(lambda: tuning.ask(tuning.commands.use_preset(name), client))
+                call_on_loop(lambda: tuning.ask(tuning.commands.use_preset(name), client))
 
         values = parameters.flat()
         for stage, specs in itertools.groupby(MAIN, lambda spec: spec.stage):
@@ -116,7 +116,9 @@ class TunePanel:
         @widget.on_update
         async def _(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:  # None: set by the server
-                self._cross(self._tuning.change, spec.name, _meant(spec, event.target.value), event.client)
+                self._call_on_loop(
+                    self._tuning.change, spec.name, _meant(spec, event.target.value), event.client
+                )
 
         return widget
 

@@ -182,8 +182,8 @@ class Scene:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 105, 78))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
-        self._tune = TunePanel(gui, self._parameters, self._preset, self._tuning, self._cross)
-        add_hotkeys(gui, self._on_camera, functools.partial(self._cross, self._on_follow))
+        self._tune = TunePanel(gui, self._parameters, self._preset, self._tuning, self._call_on_loop)
+        add_hotkeys(gui, self._on_camera, functools.partial(self._call_on_loop, self._on_follow))
         self._add_nodes()
 
     def _add_nodes(self) -> None:
@@ -205,8 +205,8 @@ class Scene:
             shadow_opacity=0.0,
         )
         self._robot = RobotNodes(scene)
-        self._scan = ScanNodes(scene, functools.partial(self._cross, self._on_cluster))
-        self._map = MapNodes(scene, functools.partial(self._cross, self._on_tree))
+        self._scan = ScanNodes(scene, functools.partial(self._call_on_loop, self._on_cluster))
+        self._map = MapNodes(scene, functools.partial(self._call_on_loop, self._on_tree))
         self._voxels = VoxelNode(scene)
         self._gathered = MapCloud(scene)
         self._errors = ErrorNode(scene)
@@ -263,7 +263,7 @@ class Scene:
 
     # --- callbacks in the thread of viser, passed to the loop -------------------------------------
 
-    def _cross(self, function: Callable[..., None], *arguments: Any) -> None:  # noqa: ANN401
+    def _call_on_loop(self, function: Callable[..., None], *arguments: Any) -> None:  # noqa: ANN401
         """Call a function on the loop of the server, from any thread; nothing if the loop has ended."""
         with contextlib.suppress(RuntimeError):  # the loop has ended before viser's thread
             self._loop.call_soon_threadsafe(function, *arguments)
@@ -290,7 +290,7 @@ class Scene:
         self._tuning.ask(self._commands.choose_view("follow", not self._view.follow), None)
 
     def _on_camera(self, name: str, client: viser.ClientHandle) -> None:
-        self._cross(self._aim, name, client)
+        self._call_on_loop(self._aim, name, client)
 
     def _aim(self, name: str, client: viser.ClientHandle) -> None:
         """Turn the camera of one browser to the robot: from above for "top", else from behind."""

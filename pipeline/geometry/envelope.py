@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pipeline.geometry.pose_arrays import Int
 from pipeline.geometry.poses import Float
-
-Int = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -44,7 +44,7 @@ VIEWS_MAX = 256
 MARGINALS = 16  # keyframes whose covariance is computed; it is interpolated in between
 
 
-class Places(NamedTuple):
+class MatrixLayout(NamedTuple):
     """Places of the unknowns in the reduced matrix.
 
     Attributes:
@@ -115,10 +115,10 @@ class Problem:
         self.u = np.array(motion).reshape(-1, 3)
         floor = np.diag(np.square(MOTION_SIGMA_MIN))
         self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
-        self.places, self.envelope = self._elimination_order()
+        self.layout, self.envelope = self._elimination_order()
 
-    def _elimination_order(self) -> tuple[Places, Envelope]:
-        """Return the places of the unknowns in the reduced matrix, and its envelope."""
+    def _elimination_order(self) -> tuple[MatrixLayout, Envelope]:
+        """Return the layout of the unknowns in the reduced matrix, and its envelope."""
         from scipy import sparse
         from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -137,7 +137,7 @@ class Problem:
         columns = [pose[pairs.col]] * 3 + [pose[self.row[kept]]] * 2
         count = 3 * K + 2 * int(remains.sum())
         envelope = Envelope.of(np.concatenate(rows), np.concatenate(columns), count, SIDE)
-        return Places(pose, stem, envelope.first, envelope.width, envelope.offset), envelope
+        return MatrixLayout(pose, stem, envelope.first, envelope.width, envelope.offset), envelope
 
     def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Normal] | None:
         """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
@@ -232,8 +232,8 @@ class Problem:
         except np.linalg.LinAlgError:
             return None
         step = -factor.solve(right)
-        dx = step[self.places.pose[:, None] + np.arange(3)]
-        dl = _stem_steps(normal, inverse_V, self.row, self.begin, self.places, step)
+        dx = step[self.layout.pose[:, None] + np.arange(3)]
+        dl = _stem_steps(normal, inverse_V, self.row, self.begin, self.layout, step)
         return (dx, dl) if np.isfinite(dx).all() and np.isfinite(dl).all() else None
 
     def _reduced(self, normal: Normal, damping: float) -> tuple[Factor, Float, Float]:
@@ -251,8 +251,8 @@ class Problem:
             LinAlgError: The reduced matrix is not positive definite.
         """
         values, right = np.zeros(self.envelope.offset[-1]), np.zeros(self.envelope.count)
-        _write_poses(normal, self.first, self.second, self.places, damping, values, right)
-        inverse_V = _write_stems(normal, self.row, self.begin, self.places, damping, values, right)
+        _write_poses(normal, self.first, self.second, self.layout, damping, values, right)
+        inverse_V = _write_stems(normal, self.row, self.begin, self.layout, damping, values, right)
         return Factor(values, self.envelope), right, inverse_V
 
     def marginals(self, normal: Normal) -> tuple[Float, Float]:
@@ -266,7 +266,7 @@ class Problem:
         K = len(self.pose)
         factor, _, _ = self._reduced(normal, 0.0)
         chosen = np.unique(np.r_[1, np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64)])
-        rows = self.places.pose[chosen, None] + np.arange(3)
+        rows = self.layout.pose[chosen, None] + np.arange(3)
         unit = np.zeros((self.envelope.count, rows.size))
         unit[rows.ravel(), np.arange(rows.size)] = 1.0
         inverse = factor.solve(unit)
@@ -329,50 +329,50 @@ def _add_detections(
 
 
 @compiled
-def _entry(row: int, column: int, places: Places) -> int:
+def _entry(row: int, column: int, layout: MatrixLayout) -> int:
     """Return where the entry of a row and a column up to it is stored."""
     block = row // SIDE
-    start = places.offset[block] - SIDE * places.first[block]
-    at: int = start + (row - SIDE * block) * places.width[block] + column
+    start = layout.offset[block] - SIDE * layout.first[block]
+    at: int = start + (row - SIDE * block) * layout.width[block] + column
     return at
 
 
 @compiled
 def _write_poses(
-    normal: Normal, first: Int, second: Int, places: Places, damping: float, values: Float, right: Float
+    normal: Normal, first: Int, second: Int, layout: MatrixLayout, damping: float, values: Float, right: Float
 ) -> None:
     """Write the blocks of poses, motions and loops into the reduced matrix.
 
     Args:
         normal: Normal equations.
         first, second: Poses of each motion and loop, int64, shape (E,).
-        places: Places of the unknowns.
+        layout: Places of the unknowns.
         damping: Share of the diagonal that is added to it.
-        values: Entries of the reduced matrix in the places of the envelope, zeros at first; filled on and
+        values: Entries of the reduced matrix in the layout of the envelope, zeros at first; filled on and
             below the diagonal. Rows beyond the last unknown become those of the identity.
         right: Gradient in the order of the unknowns, shape (N,); filled for the poses.
     """
-    place = places.pose
+    place = layout.pose
     for k in range(place.shape[0]):
         for p in range(3):
             right[place[k] + p] = normal.g_x[k, p]
-            at = _entry(place[k] + p, place[k], places)
+            at = _entry(place[k] + p, place[k], layout)
             for q in range(p + 1):
                 values[at + q] += normal.U[k, p, q]
             values[at + p] += damping * normal.U[k, p, p] + REGULAR + (FIXED if k == 0 else 0.0)
     for e in range(first.shape[0]):
         i, j = place[first[e]], place[second[e]]
         for p in range(3):
-            at = _entry(max(i, j) + p, min(i, j), places)
+            at = _entry(max(i, j) + p, min(i, j), layout)
             for q in range(3):
                 values[at + q] += normal.edge[e, p, q] if i < j else normal.edge[e, q, p]
-    for n in range(right.shape[0], SIDE * places.first.shape[0]):
-        values[_entry(n, n, places)] = 1.0
+    for n in range(right.shape[0], SIDE * layout.first.shape[0]):
+        values[_entry(n, n, layout)] = 1.0
 
 
 @compiled
 def _write_stems(
-    normal: Normal, row: Int, begin: Int, places: Places, damping: float, values: Float, right: Float
+    normal: Normal, row: Int, begin: Int, layout: MatrixLayout, damping: float, values: Float, right: Float
 ) -> Float:
     """Subtract W V^-1 W^T of the eliminated stems from the reduced matrix and W V^-1 g_l from its gradient,
     and write the blocks of the others; return V^-1 of the eliminated ones as xx, xy, yy, shape (L, 3).
@@ -381,10 +381,10 @@ def _write_stems(
         normal: Normal equations.
         row: Pose of each detection, int64, shape (M,).
         begin: First detection of each stem, and M, int64, shape (L + 1,).
-        places, damping, values: See `_write_poses`.
+        layout, damping, values: See `_write_poses`.
         right: Gradient in the order of the unknowns, shape (N,); changed in place.
     """
-    place, stem = places.pose, places.stem
+    place, stem = layout.pose, layout.stem
     inverse = np.zeros((normal.V.shape[0], 3))
     T = np.empty((3, 2))
     for j in range(inverse.shape[0]):
@@ -392,13 +392,13 @@ def _write_stems(
         yy = (1.0 + damping) * normal.V[j, 2] + REGULAR
         xy = normal.V[j, 1]
         if stem[j] >= 0:
-            values[_entry(stem[j], stem[j], places)] += xx
-            values[_entry(stem[j] + 1, stem[j], places)] += xy
-            values[_entry(stem[j] + 1, stem[j] + 1, places)] += yy
+            values[_entry(stem[j], stem[j], layout)] += xx
+            values[_entry(stem[j] + 1, stem[j], layout)] += xy
+            values[_entry(stem[j] + 1, stem[j] + 1, layout)] += yy
             for q in range(2):
                 right[stem[j] + q] = normal.g_l[j, q]
                 for m in range(begin[j], begin[j + 1]):
-                    at = _entry(stem[j] + q, place[row[m]], places)
+                    at = _entry(stem[j] + q, place[row[m]], layout)
                     for p in range(3):
                         values[at + p] += normal.W[m, p, q]
             continue
@@ -414,31 +414,33 @@ def _write_stems(
                 if place[row[n]] < column:
                     continue
                 for p in range(3):
-                    at = _entry(place[row[n]] + p, column, places)
+                    at = _entry(place[row[n]] + p, column, layout)
                     for q in range(3 if place[row[n]] > column else p + 1):
                         values[at + q] -= normal.W[n, p, 0] * T[q, 0] + normal.W[n, p, 1] * T[q, 1]
     return inverse
 
 
 @compiled
-def _stem_steps(normal: Normal, inverse_V: Float, row: Int, begin: Int, places: Places, step: Float) -> Float:
+def _stem_steps(
+    normal: Normal, inverse_V: Float, row: Int, begin: Int, layout: MatrixLayout, step: Float
+) -> Float:
     """Return the steps of the stems, shape (L, 2) [m]: -V^-1 (g_l + W^T dx) of the eliminated ones.
 
     Args:
         normal: Normal equations.
-        inverse_V, row, begin, places: See `_write_stems`.
+        inverse_V, row, begin, layout: See `_write_stems`.
         step: Step of all unknowns of the reduced matrix, shape (N,).
     """
     dl = np.empty((inverse_V.shape[0], 2))
     for j in range(dl.shape[0]):
-        at = places.stem[j]
+        at = layout.stem[j]
         if at >= 0:
             dl[j, 0], dl[j, 1] = step[at], step[at + 1]
             continue
         gx, gy = normal.g_l[j, 0], normal.g_l[j, 1]
         for m in range(begin[j], begin[j + 1]):
             for p in range(3):
-                dx = step[places.pose[row[m]] + p]
+                dx = step[layout.pose[row[m]] + p]
                 gx += normal.W[m, p, 0] * dx
                 gy += normal.W[m, p, 1] * dx
         dl[j, 0] = -inverse_V[j, 0] * gx - inverse_V[j, 1] * gy
