@@ -51,12 +51,6 @@ def compiled_borrowing(function: Callable[P, R]) -> Callable[P, R]:
     return _kernel(function, _nrt=False)
 
 
-def compiled_within(function: Callable[P, R]) -> Callable[P, R]:
-    """Return a kernel like `compiled_borrowing` that is inlined in each kernel that calls it: a call passes
-    each array as eight numbers, which costs more than a short loop."""
-    return _kernel(function, _nrt=False, inline="always")
-
-
 def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     """Return a kernel like `compiled` for sums over arrays, with vector registers, which is several times
     faster. The order of the terms is fixed at compilation: runs on one kind of processor give the same bytes,

@@ -23,6 +23,7 @@ from pipeline.geometry.poses import Float, Pose2, Pose3
 from pipeline.ground.terrain_map import HeightMapper, HeightMapState
 from pipeline.loop_closure import detection
 from pipeline.loop_closure.correction import (
+    DoubledTrees,
     LoopClosure,
     RelocalisedPose,
     Restart,
@@ -30,10 +31,10 @@ from pipeline.loop_closure.correction import (
     Smoothing,
 )
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
-from pipeline.odometry.gyro import fused
+from pipeline.odometry.gyro import UNUSED, fused
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.slam.measured_pose import REJECTED, within_gate
-from pipeline.slam.motion import noise_of, step_variances
+from pipeline.slam.motion import noise_of, step_covariance
 from pipeline.slam.particle_ancestry import TrajectoryBuffer
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
@@ -86,7 +87,7 @@ class MapperState:
     delayed: PathCorrection | None = None
 
 
-Correction = Restart[MapperState] | RelocalisedPose | LoopClosure | Smoothing | SearchFailure
+Correction = Restart[MapperState] | RelocalisedPose | LoopClosure | DoubledTrees | Smoothing | SearchFailure
 
 
 class Mapper:
@@ -128,7 +129,7 @@ class Mapper:
             parameters.classification, all_around=sensor.rings > 0, forests=forests
         )
         self._terrain = HeightMapper()
-        self._tracker = Tracker(parameters.tracking)
+        self._tracker = Tracker(parameters.tracking, sensor.azimuth_step)
         self._relocaliser: Relocaliser[MapperState] = Relocaliser(seed)
         self._path = TrajectoryBuffer()
         self._odometry: Pose2 | None = None
@@ -294,8 +295,9 @@ class Mapper:
         due = interval > 0.0 and step.is_due(interval)
         period = step.period_ns * 1e-9
         motion = Motion(
-            driven, step.slack, step.doubt, step.measured, due=due, is_view=step.is_view, period=period
-        )
+            driven, step.slack, step.doubt, step.measured, step.covariance, due=due, is_view=step.is_view,
+            period=period,
+        )  # fmt: skip
         if before is not None and step.unreported is not None:
             if not self._slam.is_led_by_trees:
                 return self._gated(motion)
@@ -304,13 +306,15 @@ class Mapper:
 
     def _with_gyro(self, step: Step, motion: Motion) -> Motion:
         """Return the motion of a step fused with the turn by the gyroscope; unchanged if the turn or the
-        odometry is unknown or the parameter `acquisition.gyro` is off."""
+        odometry is unknown or the parameter `acquisition.gyro` is off. A turn that contradicts LiDAR odometry
+        is not used and makes a doubt."""
         driven = motion.step
         if step.turn is None or step.T_odom_base is None or not self._parameters.acquisition.gyro:
             return motion
-        _, variance = step_variances(driven.x, driven.y, driven.yaw, noise_of(self._parameters.slam))
-        sigma = math.sqrt(variance)
+        sigma = math.sqrt(step_covariance(motion, noise_of(self._parameters.slam))[2, 2])
         turned, turn_sigma, slack, doubt = fused(driven, sigma, step.slack, step.turn)
+        if doubt and motion.covariance is not None:  # registered scans cannot slip
+            return motion._replace(doubt=step.doubt or UNUSED)
         return motion._replace(step=turned, slack=slack, doubt=step.doubt or doubt, turn_sigma=turn_sigma)
 
     def _gated(self, motion: Motion) -> tuple[Motion, tuple[str, ...]]:
@@ -431,17 +435,22 @@ class Mapper:
         return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_lost else None
 
     def _check_loop(self, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
-        """Return the loop that the robot has just closed, or `Smoothing` if the graph is to be solved; None
-        otherwise, at a scan that is no keyframe, and during the search of a lost robot. Loops are not
-        searched for if the parameter `relocalisation.method` is "none"."""
+        """Return the loop that the robot has just closed, by a constellation or by doubled trees, or
+        `Smoothing` if the graph is to be solved; None otherwise, at a scan that is no keyframe, and during
+        the search of a lost robot. Loops are not searched for if the parameter `relocalisation.method` is
+        "none"."""
         p = self._parameters.relocalisation
         if self._relocaliser.is_searching or not self._slam.is_keyframe:
             return None
-        if p.method != "none" and self._is_search_due():
+        if p.method != "none" and len(self._path) > 1:
             with self._timer("slam"):
-                loop = detection.find_loop(self._history(estimate), p)
+                run = self._history(estimate)
+                loop = detection.find_loop(run, p) if self._is_search_due() else None
+                displaced = detection.find_displaced(run, p) if loop is None else None
             if loop is not None:
                 return LoopClosure(loop)
+            if displaced is not None:
+                return LoopClosure(displaced, is_doubled=True)
         return Smoothing() if self._slam.is_smoothing_due else None
 
     def _is_search_due(self) -> bool:
@@ -495,12 +504,12 @@ class Mapper:
                 if not self._correct_map(slam.smooth(index), estimate):
                     return estimate, None
                 return slam.estimate(estimate), correction
-            case LoopClosure(loop=loop, stems=stems):
+            case LoopClosure(loop=loop, stems=stems, is_doubled=is_doubled):
                 if self._correct_map(slam.close(index, loop), estimate):
                     self._closed = index
                     estimate = slam.estimate(estimate)
                 elif stems is None:
-                    return estimate, None
+                    return estimate, DoubledTrees() if is_doubled else None
                 else:  # the graph contradicts the path to the place, not the place itself
                     located = RelocalisedPose(loop.T_map_base, loop.covariance, stems)
                     return self._apply(index, located, estimate)
@@ -510,6 +519,8 @@ class Mapper:
                 estimate = slam.estimate(estimate)
             case SearchFailure():
                 slam.reset_health()
+            case DoubledTrees():
+                return estimate, correction
         self._relocaliser.reset()
         return estimate, correction
 

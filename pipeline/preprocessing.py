@@ -28,7 +28,7 @@ def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[F
 
     Args:
         step: Scan with tilt and velocity of the robot.
-        T_base_lidar: Pose of the LiDAR on the robot.
+        T_base_lidar: Pose of the LiDAR on the robot, unless the scan has its own.
         parameters: Range limits (inclusive, before de-skewing), levelling and de-skewing.
 
     Returns:
@@ -67,13 +67,14 @@ def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Fl
 
 
 def _level_rotation(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
-    """Return R_level_lidar, shape (3, 3), and the position of the sensor in the level base frame, shape (3,)
-    [m], by the tilt of the step and the pose of the LiDAR on the robot. If `level` is not "imu" or the tilt
-    of the step is unknown, the level frame has the axes of the base.
+    """Return R_level_lidar, shape (3, 3), of the LiDAR that made the scan, and the position of the sensor in
+    the level base frame, shape (3,) [m], by the tilt of the step and the pose of the LiDAR on the robot. If
+    `level` is not "imu" or the tilt of the step is unknown, the level frame has the axes of the base.
     """
     level = parameters.level == "imu" and step.tilt_known
     R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
-    return R_level_base @ T_base_lidar.R, R_level_base @ T_base_lidar.t
+    mounted = step.scan.T_base_lidar or T_base_lidar
+    return R_level_base @ mounted.R, R_level_base @ mounted.t
 
 
 def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, float]:

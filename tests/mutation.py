@@ -161,6 +161,7 @@ MUTANTS = (
     ),
     Mutant(_RULE, "GONE * (c.present + c.absent)", "GONE * c.present", _RULE_TESTS),
     Mutant(_RULE, "(c.absent >= GONE_SCANS) & ", "", _RULE_TESTS),
+    Mutant(_RULE, "c.absent_lately >= LEFT_SCANS", "c.absent_lately > LEFT_SCANS", _RULE_TESTS),
     Mutant(_RAYS, "clear_range[b] > reach + BEHIND", "clear_range[b] > reach", _RAYS_TESTS),
     Mutant(_RAYS, "abs(clear_range[b] - reach) < NEAR", "clear_range[b] - reach < NEAR", _RAYS_TESTS),
     Mutant(_SCORE, "counted[matched] = in_reach[truth_of[matched]]", "pass", _EVALUATION),

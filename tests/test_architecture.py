@@ -121,3 +121,15 @@ def test_help_loads_nothing_heavy(words):
     )
     assert told.returncode == 0, told.stderr
     assert "HEAVY []" in told.stdout
+
+
+def test_the_web_process_starts_without_numerical_libraries():
+    code = (
+        "import sys, app.web.app, app.web.serving, app.scene.scene\n"
+        "print('HEAVY', sorted({'numba', 'scipy', 'sklearn', 'open3d'} & set(sys.modules)))"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert told.returncode == 0, told.stderr
+    assert "HEAVY []" in told.stdout

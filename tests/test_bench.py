@@ -14,10 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.cli import FAILED, WRONG_USAGE, bench, main
+from app.cli import FAILED, WRONG_USAGE
 from pipeline.config import preset
 from pipeline.errors import StemmapError
 from tests.benchmarks import process, recorded, runner
+from tests.benchmarks.__main__ import main
 from tests.benchmarks.campaign import Result
 from tests.benchmarks.cases import campaign
 from tests.benchmarks.cases.peer import Comparison, compare
@@ -114,11 +115,11 @@ def test_a_run_writes_both_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(runner, "tables_of", fail_for_slam)
     out, json_file = tmp_path / "b.md", tmp_path / "b.json"
-    arguments = ["bench", "scan", "slam", "--date", "2026-01-31", "--out", str(out), "--json", str(json_file)]
+    arguments = ["scan", "slam", "--date", "2026-01-31", "--out", str(out), "--json", str(json_file)]
     assert main(arguments) == FAILED  # one failed, the other is written
     text = out.read_text(encoding="utf-8")
     assert "## scan" in text
-    assert "`stemmap bench scan`, 2026-01-31" in text
+    assert "`python -m tests.benchmarks scan`, 2026-01-31" in text
     assert "## slam" not in text
     written = json.loads(json_file.read_text(encoding="utf-8"))
     assert list(written["benchmarks"]) == ["scan"]
@@ -147,29 +148,21 @@ def test_a_campaign_goes_on_after_its_finished_steps_and_reports_all(
 
 def test_the_list_runs_nothing(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runner, "tables_of", lambda _name: pytest.fail("it ran"))
-    assert main(["bench", "--list"]) == 0
+    assert main(["--list"]) == 0
     assert set(runner.descriptions()) <= set(capsys.readouterr().out.split())
 
 
 def test_wrong_words_are_said_in_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["bench", "speed"]) == WRONG_USAGE
+    assert main(["speed"]) == WRONG_USAGE
     assert "there is no benchmark 'speed'" in capsys.readouterr().err
-    assert main(["bench", "scan", "--out", str(tmp_path / "none" / "b.md")]) == FAILED
+    assert main(["scan", "--out", str(tmp_path / "none" / "b.md")]) == FAILED
     assert "no such folder" in capsys.readouterr().err
-    assert main(["bench", "scan", "--pictures", str(tmp_path)]) == WRONG_USAGE
+    assert main(["scan", "--pictures", str(tmp_path)]) == WRONG_USAGE
     assert "'scan' has no picture" in capsys.readouterr().err
-    assert main(["bench", "loops", "--pictures", str(tmp_path / "none")]) == FAILED
+    assert main(["loops", "--pictures", str(tmp_path / "none")]) == FAILED
     assert "no such folder" in capsys.readouterr().err
-    assert main(["bench", "--date", "tomorrow"]) == WRONG_USAGE
+    assert main(["--date", "tomorrow"]) == WRONG_USAGE
     assert "not a date" in capsys.readouterr().err
-
-
-def test_an_installed_package_says_that_it_needs_the_source_tree(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(bench, "_ROOT", tmp_path)
-    assert main(["bench"]) == FAILED
-    assert "clone of the source tree" in capsys.readouterr().err
 
 
 def test_a_process_that_fails_is_told(capfd: pytest.CaptureFixture[str]) -> None:

@@ -46,6 +46,12 @@ def test_titles_within_a_stage_differ():
         assert len(titles) == len(set(titles))
 
 
+def test_no_id_of_the_page_occurs_twice():
+    text = (ROOT / "static" / "index.html").read_text(encoding="utf-8")
+    ids = re.findall(r'\sid="([^"]+)"', text)
+    assert [name for name in sorted(set(ids)) if ids.count(name) > 1] == []
+
+
 def tracked() -> list[str]:
     """Return the files under version control."""
     try:

@@ -14,6 +14,7 @@ import numpy as np
 
 from app.batch.run_folder import is_of_cloud, read_run_record
 from app.batch.summary import RunTotals
+from app.sources.opening import open_source
 from app.store.forests import mapper_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
@@ -22,7 +23,7 @@ from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import decode, encode, read_archive, write_archive
 from pipeline.io.checkpoints.codec import damaged
 from pipeline.io.checkpoints.saved_map import SavedMap
-from pipeline.io.readers import SourceOptions, open_source
+from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.base import Source
 from pipeline.loop_closure.stem_matching import MapStems, Match, find_constellation
 from pipeline.mapper import Mapper
@@ -30,7 +31,7 @@ from pipeline.odometry.synchroniser import OdometryChoice, steps
 from pipeline.types.records import Step, Truth
 
 STATE = "state.zip"
-FORMAT = 8
+FORMAT = 9
 LARGEST_FILE = 4 << 30
 Start = Literal["auto", "resume", "last"] | Pose2
 GIVEN_SIGMA = (0.3, 0.3, np.radians(5.0))  # m, m, rad; accuracy of a pose that a user gives
@@ -123,7 +124,11 @@ def read_saved_run(folder: Path) -> SavedRun:
         ) from None
     tree, blob = read_archive(data, str(file))
     if isinstance(tree, dict) and tree.get("format") != FORMAT:
-        raise damaged(str(file), f"it has format {tree.get('format')!r} and not {FORMAT}")
+        raise StemmapError(
+            f"its state has format {tree.get('format')!r}, and this version reads {FORMAT}",
+            where=str(file),
+            remedy="Map the recording again with this version",
+        )
     try:
         saved = decode(SavedRun, tree, blob)
         if not saved.sources or not len(saved.map.stamp_ns):

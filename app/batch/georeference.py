@@ -12,6 +12,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from app.batch.run_folder import is_of_cloud, read_run, read_run_record, read_terrain, read_tree_places
 from pipeline.errors import SourceError, StemmapError
@@ -63,7 +64,6 @@ class MapFrame:
             already in it), "hand", "control" (points) or "gnss" (fixes); "" if unknown.
         numbers: Dict from the names in METHOD_NUMBERS to the numbers of the method; empty for "cloud", "file"
             and "hand".
-        note: How it was found as an English text, of a file of an earlier version without method; "" else.
         sigma: Standard deviation of a position by this georeference, at the centre of its points [m]; NaN if
             unknown.
         residuals: Name and residual east, north [m] of each control point.
@@ -75,7 +75,6 @@ class MapFrame:
     z: float = 0.0
     method: str = ""
     numbers: Mapping[str, float] = field(default_factory=dict)
-    note: str = ""
     sigma: float = math.nan
     residuals: tuple[tuple[str, float, float], ...] = ()
     place: str = ""
@@ -94,7 +93,7 @@ class MapFrame:
     def method_words(self) -> str:
         """How the frame was found, in English and to follow the word "by": the note if there is one; "the
         source" if the method is unknown."""
-        return self.note or _METHOD_WORDS[self.method].format(**self.numbers)
+        return _METHOD_WORDS[self.method].format(**self.numbers)
 
     def to_crs(self, points: Float) -> Float:
         """Return positions x, y in the map, shape (N, 2) [m], as east, north in the reference system, shape
@@ -119,7 +118,6 @@ class MapFrame:
             "sigma_m": None if math.isnan(self.sigma) else self.sigma,
             "method": self.method,
             "numbers": dict(self.numbers),
-            **({"how": self.note} if self.note else {}),
             "residuals_m": [list(row) for row in self.residuals],
             "place": self.place,
         }
@@ -322,9 +320,9 @@ def read_map_frame(folder: FilePath) -> MapFrame:
         residuals = tuple((str(n), float(e), float(m)) for n, e, m in given["residuals_m"])
         if not all(abs(v) < COORDINATE_LIMIT for v in (x, y, yaw, z)):
             raise ValueError("out of range")
-        method, numbers, note = _method_of(given)
+        method, numbers = _method_of(given)
         crs, place = _known(str(given["crs"])), str(given.get("place", ""))
-        return MapFrame(crs, Pose2(x, y, yaw), z, method, numbers, note, sigma, residuals, place)
+        return MapFrame(crs, Pose2(x, y, yaw), z, method, numbers, sigma, residuals, place)
     except pyproj.exceptions.ProjError:
         raise SourceError(
             f"this version of PROJ does not know the reference system of {FILE}",
@@ -348,23 +346,16 @@ def _known(crs: str) -> str:
     return crs
 
 
-def _method_of(given: dict[str, Any]) -> tuple[str, dict[str, float], str]:
-    """Return `method`, `numbers` and `note` of `MapFrame` from a record. For a record of an earlier version,
-    which has only the text `how`, the method is "hand" or "file" if the text states it, else "" with the text
-    as note.
+def _method_of(given: dict[str, Any]) -> tuple[str, dict[str, float]]:
+    """Return `method` and `numbers` of `MapFrame` from a record.
 
     Raises:
         ValueError, KeyError, TypeError: The method is unknown, or a number is missing.
     """
-    if "method" not in given:
-        how = str(given["how"])
-        earlier = {"hand": "hand", "the coordinates of the file": "file"}.get(how.removeprefix("by "), "")
-        return earlier, {}, "" if earlier else how.removeprefix("by ")
     method = str(given["method"])
     if method and method not in METHODS:
         raise ValueError("an unknown method")
-    numbers = {name: float(given["numbers"][name]) for name in METHOD_NUMBERS.get(method, ())}
-    return method, numbers, str(given.get("how", ""))
+    return method, {name: float(given["numbers"][name]) for name in METHOD_NUMBERS.get(method, ())}
 
 
 def write_map_frame(folder: FilePath, record: dict[str, Any]) -> None:
@@ -607,8 +598,43 @@ def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
 
     if not len(terrain):
         return np.full(len(points), np.nan)
-    distance, row = cKDTree(terrain[:, :2]).query(np.reshape(points, (-1, 2)))
+    points = np.reshape(points, (-1, 2))
+    row = _cells_of(terrain[:, :2], points)
+    far = np.flatnonzero(row < 0)
+    if len(far):
+        _, row[far] = cKDTree(terrain[:, :2]).query(points[far])
+    distance = np.hypot(*(points - terrain[row, :2]).T)
     return np.where(distance <= reach, terrain[row, 2], np.nan)
+
+
+_MOST_CELLS = 1 << 24  # of the grid around all cells, 128 MB
+
+
+def _cells_of(centres: Float, points: Float) -> NDArray[np.int64]:
+    """Return the row of the cell in which each position lies, shape (N,); -1 for a position in no cell, and
+    for all positions if the cells are no square grid.
+
+    Args:
+        centres: Centres of the cells, rounded to 1 mm, shape (K, 2) [m].
+        points: Positions, finite, shape (N, 2) [m].
+    """
+    nowhere = np.full(len(points), -1)
+    sides = [np.diff(np.unique(column)) for column in centres.T]
+    side = min((float(np.median(steps)) for steps in sides if len(steps)), default=0.0)
+    if side < 0.01:
+        return nowhere
+    low = centres.min(axis=0)
+    place = (centres - low) / side
+    key = np.rint(place).astype(np.int64)
+    wide, long = (key.max(axis=0) + 1).tolist()
+    if np.abs(place - key).max() > 0.01 or wide * long > _MOST_CELLS:
+        return nowhere
+    grid = np.full((wide, long), -1)
+    grid[key[:, 0], key[:, 1]] = np.arange(len(centres))
+    at = np.rint(np.clip((points - low) / side, -1.0, [wide, long])).astype(np.int64)
+    inside = ((at >= 0) & (at < [wide, long])).all(axis=1)
+    nowhere[inside] = grid[at[inside, 0], at[inside, 1]]
+    return nowhere
 
 
 def frame_lines(frame: MapFrame) -> list[str]:

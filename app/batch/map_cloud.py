@@ -1,8 +1,8 @@
 """Maps a whole cloud of a plot and writes the same files as for a run.
 
-Positions are in the coordinates of the cloud. `path.csv` has no rows, because there is no drive, and there is
-no `state.zip`. `slices.csv` contains the cross-sections of all trees, `terrain.csv` the visible ground,
-`seen.csv` the area that the cloud covers.
+Positions are in the coordinates of the cloud; other lengths are in metres. `path.csv` has no rows, because
+there is no drive, and there is no `state.zip`. `slices.csv` contains the cross-sections of all trees,
+`terrain.csv` the visible ground, `seen.csv` the area that the cloud covers.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from app.batch.georeference import WGS84, reproject
 from app.batch.map_run import MappingResult
-from app.batch.run_folder import NO_PATH, as_written, score_map
+from app.batch.run_folder import NO_PATH, as_written, score_map, truth_in_metres
 from app.batch.summary import FAR_FROM_PLOT, evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
 from app.store.forests import kept_forests
@@ -38,7 +38,7 @@ from pipeline.io.result_files import (
     seen_text,
 )
 from pipeline.stand.seen_area import covered_area
-from pipeline.types.records import Trees, TruthTrees, Verdict, WholeCloud
+from pipeline.types.records import CloudDescription, Trees, TruthTrees, Verdict, WholeCloud
 
 SLICE_COLUMNS = (
     "tree",
@@ -54,7 +54,12 @@ SLICE_COLUMNS = (
 
 
 def map_plot_run(
-    cloud: WholeCloud, preset: str, parameters: Parameters, truth: TruthTrees | None, folder: FilePath
+    cloud: WholeCloud,
+    preset: str,
+    parameters: Parameters,
+    truth: TruthTrees | None,
+    folder: FilePath,
+    chosen: dict[str, Any] | None = None,
 ) -> MappingResult:
     """Map a whole cloud and write its files.
 
@@ -64,6 +69,7 @@ def map_plot_run(
         parameters: All parameters.
         truth: True trees in the coordinates of the cloud, or None.
         folder: Folder for the files; those of an earlier run are replaced.
+        chosen: Choices of the user, see `SourceRequest.kept_choices`.
 
     Returns:
         The result for people; it has no times.
@@ -72,12 +78,17 @@ def map_plot_run(
         StemmapError: The cloud cannot be read, or the forest that is named does not exist.
         OSError: The folder cannot be written; it is unchanged then.
     """
-    with RunFiles(folder) as files:
-        return _map(cloud, preset, parameters, truth, files)
+    with RunFiles(folder, unit=cloud.description.crs_unit) as files:
+        return _map(cloud, preset, parameters, truth, files, chosen)
 
 
 def _map(
-    cloud: WholeCloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
+    cloud: WholeCloud,
+    preset: str,
+    parameters: Parameters,
+    truth: TruthTrees | None,
+    files: RunFiles,
+    chosen: dict[str, Any] | None,
 ) -> MappingResult:
     """Map the cloud and finish its files; arguments and errors as in `map_plot_run`."""
     about = cloud.description
@@ -85,6 +96,7 @@ def _map(
     trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
     evaluation = None
     if truth is not None:
+        truth = truth_in_metres(truth, about.crs_unit, about.offset)
         evaluation = score_map(*as_written(trees, NO_PATH, 0), truth, parameters)
     losses = {reason: n for reason, n in cloud.losses.items() if n}
     if plot.counts["apart from the plot"]:
@@ -93,7 +105,7 @@ def _map(
     lon_lat = _lon_lat(trees.position, about.crs, warnings)
     frame = {"type": "the cloud's own", "unit": "m", "crs": about.crs} if about.crs else _OWN_FRAME
     files.add_rows(_detection_rows(plot, about.offset))
-    run = _run_record(cloud, plot, preset, parameters, evaluation, warnings, losses)
+    run = _run_record(cloud, plot, preset, parameters, evaluation, warnings, losses, chosen)
     files.finish(
         trees,
         NO_PATH,
@@ -107,7 +119,7 @@ def _map(
             "seen.csv": seen_text(covered_area(plot.ground.covered_places() + about.offset[:2])),
         },
     )
-    summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]
+    summary = [*_summary(about, plot, trees, evaluation), preset_words(preset, parameters)]
     return MappingResult(summary, warnings, losses)
 
 
@@ -147,6 +159,7 @@ def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
     """
     for stem, place, verdict in zip(plot.stems, plot.place, plot.verdict, strict=True):
         x, y = place + offset[:2]
+        radius = np.maximum(stem["radius"], 0.0)  # a line through circles of another height may end before
         yield [
             "0",
             "",
@@ -154,11 +167,11 @@ def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
             number_text(y, 3),
             Verdict(int(verdict)).label,
             "",
-            number_text(stem["radius"], 3),
+            number_text(radius, 3),
             number_text(stem["scatter"], 4),
             number_text(math.degrees(stem["coverage"]), 0),
             number_text(stem["points"], 0),
-            number_text(2.0 * stem["radius"], 3),
+            number_text(2.0 * radius, 3),
             number_text(stem["last"] - stem["first"], 3),
         ]
 
@@ -201,11 +214,13 @@ def _run_record(
     evaluation: MapScores | None,
     warnings: list[str],
     losses: dict[str, int],
+    chosen: dict[str, Any] | None,
 ) -> dict[str, Any]:
     """Return the content of run.json as a dict.
 
-    The keys are `stemmap` (version); `source`, a dict with `uri`, `kind`, `sha256`, `offset_m` ([x, y, z])
-    and `crs` (None if unknown); `seed` and `scans`, both 0; `preset`, `changed` and `parameters`; `trees`
+    The keys are `stemmap` (version); `source`, a dict with `uri`, `kind`, `sha256`, `offset_m` ([x, y, z]),
+    `crs` (in metres; None if unknown), `unit` and `up` (text) and, of a cloud in feet, `crs_unit_m`; `chosen`
+    where the user chose; `seed` and `scans`, both 0; `preset`, `changed` and `parameters`; `trees`
     (number); `points`, a dict from the stage to the number of points; `verdicts`, a dict from the label to
     the number of candidates; `voxel_size_m`; `ground_m`, [minimum, maximum] of the height of the terrain in
     the coordinates of the cloud; `evaluation` (a dict, None if there is no ground truth); `warnings` and
@@ -217,6 +232,7 @@ def _run_record(
         evaluation: Scores; None if there is no ground truth.
         warnings: Messages for people.
         losses: Dict from a reason to the number of points that were left out for it.
+        chosen: Choices of the user; None without any.
     """
     about, heights = cloud.description, plot.ground.height
     verdicts = Counter(Verdict(int(v)).label for v in plot.verdict)
@@ -228,7 +244,11 @@ def _run_record(
             "sha256": about.digest,
             "offset_m": about.offset.tolist(),
             "crs": about.crs or None,
+            "unit": about.unit,
+            "up": about.up,
+            **({} if about.crs_unit == (1.0, 1.0) else {"crs_unit_m": list(about.crs_unit)}),
         },
+        **({} if chosen is None else {"chosen": chosen}),
         "seed": 0,
         "preset": preset,
         "changed": changed_values(preset, parameters),
@@ -245,11 +265,11 @@ def _run_record(
     }
 
 
-def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None) -> list[str]:
+def _summary(about: CloudDescription, plot: PlotMap, trees: Trees, evaluation: MapScores | None) -> list[str]:
     """Return the result as lines for people.
 
     Args:
-        uri: URI of the cloud.
+        about: Description of the cloud.
         plot: The map.
         trees: Trees of the map.
         evaluation: Scores; None if there is no ground truth.
@@ -259,7 +279,8 @@ def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None
     verdicts = Counter(Verdict(int(v)).label for v in plot.verdict if v != Verdict.TREE)
     refused = ", ".join(f"{n} {label}" for label, n in sorted(verdicts.items()))
     lines = [
-        f"{uri}: {count(plot.counts['read'], 'point')}, {count(len(trees.number), 'tree')}{wide}",
+        f"{about.uri}: {count(plot.counts['read'], 'point')}, {count(len(trees.number), 'tree')}{wide}",
         f"refused: {refused or 'nothing'}",
+        f"unit: {about.unit}; up: {about.up}",
     ]
     return lines + (evaluation_lines(evaluation, whole=True) if evaluation is not None else [])

@@ -40,9 +40,10 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import MapScores, PathError, path_error
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers.base import Source
-from pipeline.io.result_files import RunFiles, seen_text, terrain_text
+from pipeline.io.result_files import ODOMETRY, RunFiles, seen_text, terrain_text, tum_text
 from pipeline.jit import on_compiling
 from pipeline.mapper import Mapper
+from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.stand.seen_area import SeenArea, SeenRecorder, ViewSelection
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
@@ -185,6 +186,8 @@ def _map(
         "terrain.csv": terrain_text(mapper.height_map),
         "seen.csv": seen_text(_observed(seen.area(path), earlier)),
     }
+    if isinstance(moving, OdometryOverride) and (poses := moving.lidar_poses):
+        further[ODOMETRY] = tum_text(poses)
     files.finish(frame.trees, path, start_ns, record, state, further)
     return outcome, _Mapped(plan.source, frame.trees, path)
 

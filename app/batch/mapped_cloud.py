@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path as FilePath
@@ -18,9 +17,12 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.clouds import SYSTEM_OF_DRIVE
+from pipeline.io.result_files import ODOMETRY
 
 if TYPE_CHECKING:
-    from pipeline.types.records import WholeCloud
+    from pipeline.io.readers import Source
+    from pipeline.odometry.synchroniser import OdometryChoice
+    from pipeline.types.records import Step, WholeCloud
 
 EVERY = 5  # scans of a drive between two that are used
 MARGIN = 0.10  # m around the trunk at breast height, for lean and roughness of the stem
@@ -102,6 +104,23 @@ def _parts_of_cloud(cloud: WholeCloud) -> Iterator[Float]:
         yield part[:, :3].astype(np.float64) + cloud.description.offset
 
 
+def _every(source: Source, odometry: OdometryChoice) -> Iterator[tuple[int, Step]]:
+    """Yield the number and the step of every EVERY-th scan of a source; a simulated sensor does not scan
+    between them.
+
+    Raises:
+        SourceError: The source cannot be read.
+    """
+    from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.odometry.synchroniser import steps
+
+    simulated = isinstance(source, SimulatedSource)
+    records = source.records(every=EVERY) if isinstance(source, SimulatedSource) else source.records()
+    for index, step in enumerate(steps(records, odometry=odometry)):
+        if simulated or index % EVERY == 0:
+            yield index * (EVERY if simulated else 1), step
+
+
 def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     """Yield the thinned points of a drive in the frame of the map, shape (N, 3) [m], in parts of at most
     _CHUNK; z by the terrain of each scan and the nearest known terrain of the run. Of the scans of the path,
@@ -111,10 +130,9 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
         StemmapError: The run is live or has several recordings, its source cannot be read, or no point
             is near known ground.
     """
-    from app.batch.continue_map import at_origin
     from app.robot.address import is_live
     from app.sources.opening import open_source
-    from app.sources.request import request_of_kept, with_odometry
+    from app.sources.request import FILE, request_of_kept, with_odometry
     from pipeline.ground.scan_ground import find_terrain, height_above
     from pipeline.inventory.cloud import Thinned
     from pipeline.preprocessing import acquire
@@ -125,15 +143,18 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     if run.record.get("continued"):
         raise StemmapError("a run of several recordings has no single cloud", where=str(folder))
     odometry = str(run.record.get("odometry") or "auto")
+    # The poses of LiDAR odometry are known, and need not be found by registration again.
+    registered = folder / ODOMETRY
     request = request_of_kept(run.uri, odometry=odometry, seed=run.seed, choices=run.record.get("chosen"))
     thinned, p = Thinned(1 << 22, 0.02), run.parameters
     with closing(open_source(run.uri, request.options())) as opened:
-        source, chosen = with_odometry(opened, odometry)
+        motion = f"{FILE}{registered}" if registered.is_file() else odometry
+        source, chosen = with_odometry(opened, motion)
         T_base_lidar = source.description.T_base_lidar
-        for row, step in enumerate(at_origin(source, []).steps(source, chosen.steps, Counter())):
+        for row, step in _every(source, chosen.steps):
             if row >= len(run.path.x):
                 break
-            if row % EVERY or step.scan.stems is not None:
+            if step.scan.stems is not None:
                 continue
             raw, offset = acquire(step, T_base_lidar, p.acquisition)
             height = height_above(raw, find_terrain(raw, p.ground))

@@ -22,12 +22,12 @@ import numpy as np
 import shapely
 
 from app.batch.georeference import LOCAL, LOCAL_NAME, MapFrame, gis_package, read_map_frame
-from app.batch.run_folder import read_run
+from app.batch.run_folder import crs_unit, read_run
 from app.store.records import FRAME, KINDS, PLOT, SKIPPED, Content
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import write_texts
-from pipeline.io.result_files import CONFIRMED, OPEN, REJECTED, TREE_COLUMNS, csv_text
+from pipeline.io.result_files import CONFIRMED, OPEN, REJECTED, TREE_COLUMNS, csv_in_units, csv_text
 from pipeline.stand.plots import PLOTS_MAX, SamplePlot, checked, circle, plot_of
 
 if TYPE_CHECKING:
@@ -95,8 +95,10 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content]) -> Iterator[File
         return
     offset = run.record["source"].get("offset_m", (0.0, 0.0))
     placed = [replace(each, x=each.x + offset[0], y=each.y + offset[1]) for each in contents]
-    with (folder / "trees.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    text = (folder / "trees.csv").read_text(encoding="utf-8")
+    if text.startswith("tree,x,"):
+        text = csv_in_units(text, crs_unit(run.record), to_metres=True)
+    rows = list(csv.DictReader(text.splitlines()))
     numbers = [int(float(row["tree"])) for row in rows]
     position = np.array([(float(row["x_m"]), float(row["y_m"])) for row in rows]).reshape(-1, 2)
     reviews = reviews_of(numbers, position, placed)

@@ -11,7 +11,7 @@ import datetime
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -25,13 +25,13 @@ from pipeline.geometry.columns import rows_of
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED
 from pipeline.io.result_files import (
-    NEW_TREE_COLUMNS,
     PATH_COLUMNS,
     REJECTED,
     REVIEWS,
     SEEN_COLUMNS,
     TERRAIN_COLUMNS,
     TREE_COLUMNS,
+    csv_in_units,
     path_rows,
     tree_rows,
 )
@@ -169,6 +169,36 @@ def is_of_cloud(record: dict[str, Any]) -> bool:
     return isinstance(record.get("source"), dict) and "offset_m" in record["source"]
 
 
+def crs_unit(record: dict[str, Any]) -> tuple[float, float]:
+    """Return metres per unit of the reference system in which a record (run.json) says that the positions of
+    the run are written, horizontal and vertical; 1, 1 without one."""
+    try:
+        flat, high = (float(value) for value in record["source"]["crs_unit_m"])
+    except (KeyError, TypeError, ValueError):
+        return 1.0, 1.0
+    return (flat, high) if 0.0 < flat < math.inf and 0.0 < high < math.inf else (1.0, 1.0)
+
+
+def truth_in_metres(
+    truth: TruthTrees, unit: tuple[float, float], near: Float | Sequence[float]
+) -> TruthTrees:
+    """Return true trees in metres. Those of a cloud in feet may be in either unit: the one in which they lie
+    nearer to the cloud.
+
+    Args:
+        truth: True trees in the coordinates of the file or in metres.
+        unit: Metres per unit of the reference system, see `crs_unit`.
+        near: A position in the cloud, x, y [m].
+    """
+    if unit == (1.0, 1.0) or not len(truth.x):
+        return truth
+    scaled = replace(truth, x=truth.x * unit[0], y=truth.y * unit[0])
+    return min(
+        (truth, scaled),
+        key=lambda each: math.hypot(np.median(each.x) - near[0], np.median(each.y) - near[1]),
+    )
+
+
 def read_run_record(folder: FilePath) -> dict[str, Any]:
     """Return run.json of a folder as a dict; the values of "source" and "parameters" are dicts, other values
     are not checked.
@@ -246,31 +276,31 @@ def _text(file: FilePath) -> str:
 
 def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
     """Return a dict from the name of each column of a CSV file to its numbers, shape (rows,), in the units of
-    the file. An empty cell is NaN, and so are all cells of NEW_TREE_COLUMNS that the file does not have. A
-    cell of "review" becomes its index in REVIEWS.
+    the file; positions in metres. An empty cell is NaN; a cell of "review" becomes its index in
+    REVIEWS.
 
     Args:
         file: The file.
-        names: The expected header; NEW_TREE_COLUMNS may be missing in the file.
+        names: The expected header.
 
     Raises:
         SourceError: The file cannot be read or is larger than 256 MB, has another header or a damaged row, or
             a cell of `_NEVER_EMPTY` is empty.
     """
     damaged = SourceError("a row is damaged", where=str(file), remedy="Map the run again")
+    text = _text(file)
     try:
-        rows = list(csv.reader(_text(file).splitlines()))
-    except csv.Error:
+        if "x" in text.partition("\n")[0].split(","):  # of a cloud in feet
+            text = csv_in_units(text, crs_unit(read_run_record(file.parent)), to_metres=True)
+        rows = list(csv.reader(text.splitlines()))
+    except (csv.Error, ValueError):
         raise damaged from None
-    missing = tuple(name for name in NEW_TREE_COLUMNS if name in names and rows and name not in rows[0])
-    known = tuple(name for name in names if name not in missing)
-    if not rows or tuple(rows[0]) != known:
+    if not rows or tuple(rows[0]) != names:
         raise SourceError(f"the columns are not {', '.join(names)}", where=str(file))
     try:
-        columns = _table(rows[1:], known)
+        columns = _table(rows[1:], names)
     except ValueError:
         raise damaged from None
-    columns.update({name: np.full(len(rows) - 1, math.nan) for name in missing})
     for name in _NEVER_EMPTY.intersection(names):
         if not np.all(np.isfinite(columns[name])):
             raise SourceError(f"a cell of {name} is empty", where=str(file), remedy="Map the run again")

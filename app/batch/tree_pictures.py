@@ -11,7 +11,6 @@ from app.common.draw_picture import Drawing, draw_safely
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.base import Source
 from pipeline.io.readers.camera import Camera, PictureSource, nearest
-from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.types.records import Bool, Float, Int, Path, Trees
 
 FOLDER = "pictures"
@@ -124,6 +123,8 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
     """
     for old in (folder / FOLDER).glob("tree_*.jpg"):
         old.unlink()
+    from pipeline.odometry.odometry_override import OdometryOverride  # the web process starts without Numba
+
     origin: object = source.source if isinstance(source, OdometryOverride) else source
     if not isinstance(origin, PictureSource):
         return 0, ""

@@ -15,11 +15,12 @@ import re
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Iterator
+from types import ModuleType
 from typing import NoReturn
 
 from app.common.text import version
+from app.extension import VARIABLE, all_extensions, extensions_on, problems
 from pipeline.errors import ParameterError, StemmapError, UsageError
 
 COMMANDS = (
@@ -36,13 +37,21 @@ COMMANDS = (
     "export",
     "report",
     "params",
-    "train",
-    "tune",
-    "bench",
     "licences",
+    "extensions",
 )
 
 FAILED, WRONG_USAGE = 1, 2
+
+
+def commands() -> dict[str, str]:
+    """Return the dotted module of each command: those of this package, then those of the extensions that are
+    switched on, which replace none of an earlier one."""
+    found = {name: f"app.cli.{name}" for name in COMMANDS}
+    for extension in extensions_on().values():
+        found = {**extension.commands, **found}
+    return {name: found[name] for name in sorted(found, key=lambda each: each not in COMMANDS)}
+
 
 CODES = (
     "Exit codes: 0 done; 1 failed, with a message; 2 wrong usage, such as a mistyped flag, parameter or\n"
@@ -63,12 +72,8 @@ class _Parser(argparse.ArgumentParser):
         self.exit(WRONG_USAGE, f"{self.prog}: {message}. Help: {self.prog} --help\n")
 
 
-_PYTHON_FORMAT = warnings.formatwarning
-
-
 def command() -> NoReturn:
     """The program `stemmap`: runs `main` and ends the process with its exit code. It never returns."""
-    warnings.formatwarning = _format_warning
     code = main()
     if "zenoh" in sys.modules:
         # Threads of zenoh may abort the process while the interpreter shuts down, after all files are written
@@ -78,15 +83,6 @@ def command() -> NoReturn:
             sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
-
-
-def _format_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
-) -> str:
-    """Return a FutureWarning, which is meant for people, as one line; other warnings keep Python's format."""
-    if issubclass(category, FutureWarning):
-        return f"stemmap: {message}\n"
-    return _PYTHON_FORMAT(message, category, filename, lineno, line)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -102,7 +98,9 @@ def main(arguments: list[str] | None = None) -> int:
         wrong usage, 3 done with losses (see stderr).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if not words or (words[0] not in COMMANDS and words[0] not in ("-h", "--help", "--version")):
+    for problem in problems():
+        print(f"stemmap: {problem}", file=sys.stderr)
+    if not words or (words[0] not in commands() and words[0] not in ("-h", "--help", "--version")):
         words.insert(0, "serve")  # `stemmap run.mcap` is short for `stemmap serve run.mcap`
     # argparse takes a word such as -5,3,10 for a flag.
     for k in range(len(words) - 1, 0, -1):
@@ -115,8 +113,11 @@ def main(arguments: list[str] | None = None) -> int:
         parsed, unknown = parser.parse_known_args(words)
         if unknown:
             _refuse(unknown, parsed.command, known[parsed.command])
-        command = importlib.import_module(f"app.cli.{parsed.command}")
+        command = importlib.import_module(commands()[parsed.command])
         with _sigterm_as_ctrl_c():
+            for taker in parsed.takers:
+                if (code := taker.run(parsed)) is not None:
+                    return int(code)
             return int(command.run(parsed))
     except SystemExit as stop:  # argparse has printed its message
         return int(stop.code or 0)
@@ -143,7 +144,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:
-    """Report unknown words of a command, with the flag nearest to the first of them as remedy.
+    """Report unknown words of a command, with the flag nearest to the first of them as remedy,
+    or an extension with flags of the command that is switched off.
 
     Args:
         unknown: The words, at least one.
@@ -155,27 +157,42 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
     """
     flags = [flag for action in parser._actions for flag in action.option_strings]
     near = difflib.get_close_matches(unknown[0].split("=")[0], flags, n=1, cutoff=0.6)
+    takers_off = [
+        each.name
+        for each in all_extensions()
+        if not each.is_on and each.extension is not None and command in each.extension.takes
+    ]
+    hint = f"Did you mean {near[0]}? " if near else f"{_switched_off(takers_off[0])} " if takers_off else ""
     raise UsageError(
-        f"stemmap {command} does not know {' '.join(unknown)}",
-        remedy=(f"Did you mean {near[0]}? " if near else "") + f"See stemmap {command} --help",
+        f"stemmap {command} does not know {' '.join(unknown)}", remedy=f"{hint}See stemmap {command} --help"
     )
 
 
 def _check_command(words: list[str]) -> None:
-    """Report a mistyped command, such as `stemmap mpa run.mcap`, as such and not as a missing file. Words
-    with a colon are addresses and not checked.
+    """Report a mistyped command, such as `stemmap mpa run.mcap`, and a command of an extension that is
+    switched off as such and not as a missing file. Words with a colon are addresses and not checked.
 
     Args:
         words: Words of the command line after `main` has inserted `serve`.
 
     Raises:
-        UsageError: The first word is no command and no existing file, but similar to a command.
+        UsageError: The first word is no command and no existing file, but similar to a command, or a command
+            of an extension that is switched off.
     """
     if len(words) < 2 or words[0] != "serve" or words[1].startswith("-") or ":" in words[1]:
         return  # a flag, or an address such as sim:stand
-    near = difflib.get_close_matches(words[1], COMMANDS, n=1, cutoff=0.6)
-    if near and words[1] not in COMMANDS and not os.path.lexists(words[1]):
+    if words[1] in commands() or os.path.lexists(words[1]):
+        return
+    for each in all_extensions():
+        if not each.is_on and each.extension is not None and words[1] in each.extension.commands:
+            raise UsageError(f"there is no command {words[1]!r}", remedy=_switched_off(each.name))
+    if near := difflib.get_close_matches(words[1], commands(), n=1, cutoff=0.6):
         raise UsageError(f"there is no command {words[1]!r}", remedy=f"Did you mean `stemmap {near[0]}`?")
+
+
+def _switched_off(extension: str) -> str:
+    """Return the remedy of an error whose reason is that an extension is switched off."""
+    return f"The extension {extension} is switched off by {VARIABLE}."
 
 
 @contextlib.contextmanager
@@ -207,8 +224,14 @@ def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argpa
     )
     parser.add_argument("--version", action="version", version=f"stemmap {version()}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for name in COMMANDS:
-        module = importlib.import_module(f"app.cli.{name}")
+    for name, dotted in commands().items():
+        try:
+            module = importlib.import_module(dotted)
+        except Exception as error:  # the code of an extension
+            if name in COMMANDS:
+                raise
+            _complain(f"the command {name} is left out: {type(error).__name__}: {error}", FAILED)
+            continue
         subparser = subparsers.add_parser(
             name,
             help=module.HELP,
@@ -217,7 +240,25 @@ def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argpa
         )
         if name == wanted:
             module.configure(subparser)
+            takers = tuple(_takers(name))
+            for taker in takers:
+                taker.configure(subparser)
+            subparser.set_defaults(takers=takers)
     return parser, dict(subparsers.choices)
+
+
+def _takers(command: str) -> Iterator[ModuleType]:
+    """Yield the modules of extensions that may take over a command of the program. One that cannot be
+    imported is left out, with a message."""
+    for name, extension in extensions_on().items():
+        if command not in extension.takes:
+            continue
+        try:
+            module = importlib.import_module(extension.takes[command])
+        except Exception as error:  # the code of an extension
+            _complain(f"the extension {name} is left out of {command}: {error}", FAILED)
+            continue
+        yield module
 
 
 def _complain(error: object, code: int) -> int:

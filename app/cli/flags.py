@@ -17,14 +17,13 @@ from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.sources.request import SourceRequest
-    from app.tuning.plan import PlannedRun
     from pipeline.config import Parameters
 
 SOURCE_HELP = (
-    "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of scans (.bin, .pcd, .ply, "
+    "a recording (.mcap, .db3, .bag, .pcap), a folder of scans (.bin, .pcd, .ply, "
     ".npy, .npz, .las, .laz) or of TreeManagerState_<i>.csv stems, "
     "a whole cloud (.laz, .las, .e57, .ply, .npy, .npz), "
-    "a live robot (zenoh:tcp/host:7447, dds:?domain=0, velodyne:ADDRESS:PORT?from=SENSOR), "
+    "a live robot (zenoh:tcp/host:7447, velodyne:ADDRESS:PORT?from=SENSOR), "
     "or a simulated run such as sim:stand"
 )
 
@@ -142,36 +141,22 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry",
         type=_odometry,
-        metavar="auto|wheels|kiss-icp|static|file:POSES",
+        metavar="auto|wheels|lidar|static|file:POSES",
         default="auto",
-        help="source of the motion. auto: odometry of the source, else kiss-icp; wheels: odometry of the "
-        "source; kiss-icp: registration of the scans; static: no motion; "
+        help="source of the motion. auto: odometry of the source, else lidar; wheels: odometry of the "
+        "source; lidar: registration of the scans; static: no motion; "
         "file:poses.txt: LiDAR poses (TUM or KITTI)",
     )
 
 
-def add_keep_flag(parser: argparse._ActionsContainer) -> None:
-    """Add --keep."""
-    parser.add_argument(
-        "--keep",
-        metavar="DIR",
-        type=Path,
-        help="folder that stores results, so that they are computed once (default: in STEMMAP_FOLDER)",
-    )
-
-
-def kept_results(arguments: argparse.Namespace) -> Path | None:
-    """Return the folder of stored results: --keep, else that in the data folder; None without both. Raises
-    StemmapError if an environment variable of `app.common.settings` is invalid, also with --keep."""
-    from app.common.settings import RESULTS, from_environment
-
-    folder = from_environment().folder
-    kept: Path | None = arguments.keep
-    return kept or (folder and folder / RESULTS)
+#: Values of --as, --unit and --up, the choices of `app.sources.request` (not imported for a help text).
+FORMS = ("auto", "scan", "cloud")
+UNITS = ("auto", "m", "cm", "mm", "ft", "us-ft")
+AXES = ("auto", "z", "y", "-y", "x", "-x", "-z")
 
 
 def add_source_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --topic and --mount."""
+    """Add --topic, --mount, --as, --unit and --up; values of the last three are `form`, `unit` and `up`."""
     parser.add_argument(
         "--topic",
         metavar="ROLE=NAME",
@@ -187,6 +172,25 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
         metavar=MOUNT,
         type=numbers(MOUNT, 360.0),
         help="pose of the LiDAR on the robot, in metres and degrees (default: that of the source)",
+    )
+    parser.add_argument(
+        "--as",
+        dest="form",
+        choices=FORMS,
+        default="auto",
+        help="whether a file of points is one scan or a whole cloud of a plot (auto: by what it holds)",
+    )
+    parser.add_argument(
+        "--unit",
+        choices=UNITS,
+        default="auto",
+        help="unit of the coordinates of a whole cloud (auto: by its reference system, else by its extent)",
+    )
+    parser.add_argument(
+        "--up",
+        choices=AXES,
+        default="auto",
+        help="axis of a whole cloud that points up; --up=-y for -y (auto: by its ground)",
     )
 
 
@@ -250,9 +254,9 @@ def says_parameters(arguments: argparse.Namespace) -> bool:
 def _odometry(text: str) -> str:
     """Return the text if it is a choice of --odometry; raises argparse.ArgumentTypeError otherwise. The pose
     file of file:POSES need not exist."""
-    if text in ("auto", "wheels", "kiss-icp", "static") or (text.startswith("file:") and len(text) > 5):
+    if text in ("auto", "wheels", "lidar", "static") or (text.startswith("file:") and len(text) > 5):
         return text
-    raise argparse.ArgumentTypeError(f"{text!r} is not auto, wheels, kiss-icp, static or file:poses.txt")
+    raise argparse.ArgumentTypeError(f"{text!r} is not auto, wheels, lidar, static or file:poses.txt")
 
 
 def _topic(text: str) -> tuple[str, str]:
@@ -294,34 +298,15 @@ def source_request(arguments: argparse.Namespace, uri: str) -> SourceRequest:
 
     odometry = getattr(arguments, "odometry", "auto")
     return SourceRequest(
-        uri, odometry, arguments.seed, dict(arguments.topics), mount_of_degrees(arguments.mount)
+        uri,
+        odometry,
+        arguments.seed or 0,
+        dict(arguments.topics),
+        mount_of_degrees(arguments.mount),
+        form=getattr(arguments, "form", "auto"),
+        unit=getattr(arguments, "unit", "auto"),
+        up=getattr(arguments, "up", "auto"),
     )
-
-
-def planned_run(
-    arguments: argparse.Namespace, uri: str, truth: str | None, *, held_out: bool = False
-) -> PlannedRun:
-    """Return a run that is mapped and scored as the flags of `add_run_flags`, `add_source_flags` and
-    `add_truth_flags` give.
-
-    Args:
-        arguments: Parsed arguments.
-        uri: The run.
-        truth: File of its true trees; None for those of the source.
-        held_out: See `PlannedRun`.
-
-    Raises:
-        StemmapError: The file of true trees cannot be read.
-    """
-    from app.store.records import contents_of
-    from app.tuning.plan import PlannedRun
-    from pipeline.io.ground_truth import read_truth_trees
-
-    source = source_request(arguments, uri)
-    if truth is None:
-        return PlannedRun(source, held_out=held_out)
-    trees = read_truth_trees(Path(truth), dbh_unit=arguments.dbh_unit)
-    return PlannedRun(source, tuple(contents_of(trees)), truth, held_out)
 
 
 def source(text: str) -> str:

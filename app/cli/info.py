@@ -36,19 +36,17 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         StemmapError: The source cannot be read.
     """
-    from app.sources.opening import open_cloud, open_source
-    from pipeline.io.readers import is_cloud
+    from app.sources.opening import is_cloud, open_cloud, open_source
 
-    if is_cloud(arguments.source):
-        cloud = open_cloud(arguments.source).description
+    options = source_request(arguments, arguments.source).options()
+    if is_cloud(arguments.source, options):
+        cloud = open_cloud(arguments.source, options).description
         if arguments.json:
             print(json.dumps(_cloud_record(cloud), indent=1, allow_nan=False))
         else:
             print("\n".join(_cloud_lines(cloud)))
         return 0
-    with closing(
-        open_source(arguments.source, source_request(arguments, arguments.source).options())
-    ) as opened:
+    with closing(open_source(arguments.source, options)) as opened:
         if arguments.json:
             print(json.dumps(_record(opened), indent=1, allow_nan=False))
         else:
@@ -58,9 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _record(opened: Source) -> dict[str, Any]:
     """Return the description of a source as JSON values: `uri`, `kind`, `digest`, `scans`, `start_ns`,
-    `end_ns`, `sensor`, `T_base_lidar` (`R` and `t` [m]), `odometry` and `imu` (whether there is one),
-    `preset`, `topics`, `truth` (numbers of `trees` and `others`, and whether there is a `path`), `losses` and
-    `warnings`. Unknown values are None."""
+    `end_ns`, `times` (whether they are known or a rate is assumed), `sensor`, `T_base_lidar` (`R` and `t`
+    [m]), `odometry` and `imu` (whether there is one), `preset`, `topics`, `truth` (numbers of `trees` and
+    `others`, and whether there is a `path`), `losses`, `warnings` and `missing`. Unknown values are None."""
     from dataclasses import asdict
 
     d, truth = opened.description, opened.truth()
@@ -72,6 +70,7 @@ def _record(opened: Source) -> dict[str, Any]:
         "scans": d.scans,
         "start_ns": d.start_ns,
         "end_ns": d.end_ns,
+        "times": d.has_times,
         "sensor": asdict(d.sensor),
         "T_base_lidar": {"R": d.T_base_lidar.R.tolist(), "t": d.T_base_lidar.t.tolist()},
         "odometry": d.has_odometry,
@@ -81,16 +80,20 @@ def _record(opened: Source) -> dict[str, Any]:
         "truth": {"trees": trees, "others": others, "path": truth is not None and truth.path is not None},
         "losses": opened.losses,
         "warnings": list(d.warnings),
+        "missing": list(d.missing),
     }
 
 
 def _lines(opened: Source) -> list[str]:
     """Return the description of a source as lines: a table, warnings and losses, topics, commands."""
+    from math import degrees
+
     from app.common.text import count
     from app.sources.request import choose_odometry
 
     d, truth = opened.description, opened.truth()
     x, y, z = d.T_base_lidar.t
+    roll, pitch, yaw = (round(degrees(angle), 1) + 0.0 for angle in d.T_base_lidar.euler())
     trees, others = _truth_counts(truth)
     known = [f"{count(trees, 'tree')}, {count(others, 'other object')}"] if trees + others else []
     known += ["the path"] if truth is not None and truth.path is not None else []
@@ -98,9 +101,19 @@ def _lines(opened: Source) -> list[str]:
         ("kind", d.kind),
         ("scans", _scans(d)),
         ("LiDAR", _sensor(d.sensor)),
-        ("mounted", f"x {x:.2f} m, y {y:.2f} m, z {z:.2f} m on the robot"),
-        ("odometry", "yes" if d.has_odometry else f"no; used: {choose_odometry(d, 'auto').words}"),
-        ("IMU", "yes" if d.has_imu else "no"),
+        (
+            "mounted",
+            f"x {x:.2f} m, y {y:.2f} m, z {z:.2f} m on the robot; roll {roll:g}, pitch {pitch:g}, yaw "
+            f"{yaw:g} degrees",
+        ),
+        (
+            "odometry",
+            f"yes{_read_from(d, 'odometry')}"
+            if d.has_odometry
+            else f"no; used: {choose_odometry(d, 'auto').words}",
+        ),
+        ("IMU", f"yes{_read_from(d, 'imu')}" if d.has_imu else "no"),
+        *([("camera", f"yes{_read_from(d, 'camera')}")] if _read_from(d, "camera") else []),
         *([("GNSS", d.gnss)] if d.gnss else []),
         *([("SLAM pose", d.other_slam)] if d.other_slam else []),
         ("truth", ", ".join(known) or "none; give true trees with --truth trees.csv"),
@@ -110,24 +123,40 @@ def _lines(opened: Source) -> list[str]:
     lines = [f"{name:10}{text}" for name, text in rows]
     lines += [f"warning: {text}" for text in d.warnings]
     lines += [f"left out: {reason} ({n:,})" for reason, n in opened.losses.items() if n]
-    return lines + _topic_lines(d) + _commands(d)
+    return lines + _topic_lines(d) + _missing_lines(d) + _commands(d)
+
+
+def _read_from(d: SourceDescription, role: str) -> str:
+    """Return ", " and the names of the topics that are read in a role; ", a moving transform" for odometry
+    without a topic; "" for a source without topics."""
+    names = [plain(topic.name) for topic in d.topics if topic.read_as == role]
+    if role == "odometry" and d.topics and not names:
+        return ", a moving transform"
+    return f", {', '.join(names)}" if names else ""
 
 
 def _topic_lines(d: SourceDescription) -> list[str]:
-    """Return a table of the topics with messages and mean rates; [] for a source without topics."""
+    """Return a table of the topics with messages, mean rates and what they hold; [] for a source without
+    topics."""
+    from app.sources.topic_details import topic_details
+
     if not d.topics:
         return []
     lines = ["", "topics (* is used; --topic ROLE=NAME selects another)"]
     width = max(len(plain(topic.name)) for topic in d.topics)
-    seconds = 0.0 if d.start_ns is None or d.end_ns is None else (d.end_ns - d.start_ns) * 1e-9
     for topic in d.topics:
-        mark, use = ("*", f"used as {topic.read_as}") if topic.read_as else (" ", _not_read(topic))
+        why = f" ({plain(topic.why)})" if topic.why else ""
+        mark, use = ("*", f"used as {topic.read_as}{why}") if topic.read_as else (" ", _not_read(topic))
         name, kind = plain(topic.name), plain(topic.type)
-        rate = (
-            f"{(topic.messages - 1) / seconds:7.1f} Hz" if seconds > 0.0 and topic.messages > 1 else " " * 10
-        )
+        rate = " " * 10 if topic.rate_hz is None else f"{topic.rate_hz:7.1f} Hz"
         lines.append(f" {mark} {name:{width}}  {topic.messages:>8,}  {rate}  {kind}  {use}".rstrip())
+        lines += [f"     {word:8}{plain(text)}" for word, text in topic_details(topic)]
     return lines
+
+
+def _missing_lines(d: SourceDescription) -> list[str]:
+    """Return lines with what a recording lacks, what this costs and what helps; [] if it lacks nothing."""
+    return ["", "missing", *(f" - {plain(text)}" for text in d.missing)] if d.missing else []
 
 
 def _not_read(topic: RecordedTopic) -> str:
@@ -150,7 +179,8 @@ def _scans(d: SourceDescription) -> str:
     if d.start_ns is None or d.end_ns is None or d.end_ns <= d.start_ns:
         return f"{d.scans:,}"
     seconds = (d.end_ns - d.start_ns) * 1e-9
-    return f"{d.scans:,} in {seconds:.1f} s, {(d.scans - 1) / seconds:.1f} Hz"
+    assumed = "" if d.has_times else ", assumed: times.txt gives the times"
+    return f"{d.scans:,} in {seconds:.1f} s, {(d.scans - 1) / seconds:.1f} Hz{assumed}"
 
 
 def _sensor(sensor: Sensor) -> str:
@@ -176,8 +206,9 @@ SQUARE_M = 1.0  # smallest area for the point density [m^2]
 
 def _cloud_record(d: CloudDescription) -> dict[str, Any]:
     """Return the description of a cloud as JSON values: `uri`, `kind`, `digest`, number of `points`, the
-    corners `low_m` and `high_m` (None without a valid extent), `offset_m`, `crs` (None without), `attributes`
-    and `warnings`."""
+    corners `low_m` and `high_m` (None without a valid extent), `offset_m`, `crs` (in metres; None without),
+    `unit` and `up` with their sources, `form` (why it is taken as a whole cloud; "" for a format of clouds),
+    `attributes` and `warnings`."""
     extent = _extent(d)
     return {
         "uri": d.uri,
@@ -188,6 +219,9 @@ def _cloud_record(d: CloudDescription) -> dict[str, Any]:
         "high_m": None if extent is None else extent[1].tolist(),
         "offset_m": d.offset.tolist(),
         "crs": d.crs or None,
+        "unit": d.unit,
+        "up": d.up,
+        "form": d.form,
         "attributes": list(d.attributes),
         "warnings": list(d.warnings),
     }
@@ -199,7 +233,10 @@ def _cloud_lines(d: CloudDescription) -> list[str]:
     rows = [
         ("kind", f"whole cloud, {d.kind}"),
         ("points", f"{d.points:,}"),
+        *([("taken so", plain(d.form))] if d.form else []),
         *_extent_rows(d),
+        ("unit", plain(d.unit)),
+        ("up", plain(d.up)),
         ("CRS", _crs_words(d.crs)),
         ("attributes", ", ".join(map(plain, d.attributes)) or "only its position"),
         ("truth", "give true trees with --truth trees.csv, in the coordinates of the cloud"),

@@ -64,14 +64,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=flags.whole_number(1, (1 << 31) - 1),
         help="map N scans; --start resume maps the rest",
     )
-    parser.add_argument(
-        "--as",
-        dest="kind",
-        choices=("auto", "scans", "plot"),
-        default="auto",
-        help="plot: the file is one whole cloud of a plot (auto: .las, .laz, .ply, .npy and .npz are "
-        "plots, a .pcd is a scan)",
-    )
     parser.set_defaults(seed=None)
     parser.epilog = (
         "Writes trees.csv, path.csv, trees.geojson, detections.csv, terrain.csv, run.json and state.zip\n"
@@ -82,7 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Map a run of scans, or a whole cloud with `--as plot` or a file that holds one; print the result.
+    """Map a run of scans or a whole cloud; print the result.
 
     Returns:
         Exit code: 3 if messages or points were left out, else 0.
@@ -96,10 +88,10 @@ def run(arguments: argparse.Namespace) -> int:
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
     from app.batch.run_folder import partial_output_warnings
-    from pipeline.io.readers import is_cloud
+    from app.sources.opening import is_cloud
 
     flags.print_warnings(partial_output_warnings(arguments.out))
-    if arguments.kind == "plot" or (arguments.kind == "auto" and is_cloud(arguments.source)):
+    if is_cloud(arguments.source, flags.source_request(arguments, arguments.source).options()):
         return _run_plot(arguments)
     return _run_scans(arguments)
 
@@ -121,9 +113,10 @@ def _run_plot(arguments: argparse.Namespace) -> int:
 
     truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     name, parameters = flags.chosen_parameters(arguments, "forest")
-    cloud = open_cloud(arguments.source)
+    request = flags.source_request(arguments, arguments.source)
+    cloud = open_cloud(arguments.source, request.options())
     replaces = check_folder(arguments.out, cloud.description.digest, force=arguments.force)
-    outcome = map_plot_run(cloud, name, parameters, truth, arguments.out)
+    outcome = map_plot_run(cloud, name, parameters, truth, arguments.out, request.kept_choices())
     return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses, replaces=replaces)
 
 
@@ -214,7 +207,9 @@ def _run_scans(arguments: argparse.Namespace) -> int:
 def _tell(
     summary: list[str], out: Path, warnings: list[str], losses: dict[str, int], *, replaces: bool
 ) -> int:
-    """Print the result of a mapping command; return the exit code: 3 with losses, else 0.
+    """Print the result of a mapping command; return the exit code: 3 with losses, or if the map contradicts
+    itself, the robot or its LiDAR odometry got lost in it, or a cloud is a section through its stems or may
+    have another axis up; else 0.
 
     Args:
         summary: Lines to print.
@@ -223,13 +218,19 @@ def _tell(
         losses: Number of messages that were left out, by reason.
         replaces: Whether the folder had the files of an earlier run.
     """
+    from pipeline.inventory import SECTION
+    from pipeline.io.readers.up_axis import UP_UNCLEAR
+    from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
+    from pipeline.odometry.lidar_odometry import LOST
+
     for line in summary:
         print(line)
     print(f"files in {out}" + (" (replaced)" if replaces else ""))
     flags.print_warnings(warnings)
     for reason, number in losses.items():
         print(f"left out: {reason} ({number:,})", file=sys.stderr)
-    return 3 if losses else 0
+    wrong = (DOUBLED, LOST, NOT_FOUND, SECTION, UP_UNCLEAR)
+    return 3 if losses or any(text.startswith(wrong) for text in warnings) else 0
 
 
 def _start(text: str) -> Start:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import argparse
 import textwrap
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from app.cli import flags
 from app.common.settings import DEFAULT_PORT, VARIABLES
+from pipeline.errors import UsageError
 
 if TYPE_CHECKING:
-    from app.robot.address import ZenohAddress
+    from app.common.settings import Settings
+    from app.dashboard.parameters import ParameterState
     from app.worker.protocol import Open
 
 HELP = "open the dashboard in a browser"
@@ -26,8 +29,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="SOURCE",
         type=flags.source,
         nargs="*",
-        help=f"{flags.SOURCE_HELP} (default: {_DEFAULT_SOURCE}); several sources, or a router with several "
-        "robots, get one dashboard each and a common page",
+        help=f"{flags.SOURCE_HELP} (default: {_DEFAULT_SOURCE}); several ones get one "
+        "dashboard each and a common page",
     )
     parser.add_argument(
         "--port",
@@ -42,6 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     flags.add_parameter_flags(parser)
     flags.add_run_flags(parser)
+    flags.add_source_flags(parser)
     flags.add_live_flags(parser)
     parser.add_argument("--viewer", action="store_true", help="also print a view-only link")
     parser.add_argument("--no-browser", action="store_true", help="print the link without opening a browser")
@@ -54,12 +58,33 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until Ctrl-C; return the exit code. Several sources, or a router with several robots, are served
-    as a fleet.
+    """Serve until Ctrl-C; return the exit code.
 
     Raises:
-        StemmapError: An argument is wrong, a source does not exist, or the port cannot be used.
+        StemmapError: An argument is wrong, a source does not exist, there are several, or the port cannot be
+            used.
     """
+    settings, sources, make_parameters = requested(arguments)
+    if len(sources) > 1:
+        raise UsageError(
+            f"{len(sources)} sources are named, and a dashboard shows one",
+            remedy="Name one source; `stemmap extensions` shows what is switched off",
+        )
+    from app.web.serving import serve
+
+    return serve(settings, source=sources[0], parameter_state=make_parameters())
+
+
+def requested(
+    arguments: argparse.Namespace,
+) -> tuple[Settings, list[Open], Callable[[], ParameterState]]:
+    """Return the settings, the sources, and a function that returns the initial parameters of a dashboard.
+
+    Raises:
+        StemmapError: An argument is wrong, or a source does not exist.
+    """
+    from msgspec.structs import asdict
+
     from app.common.settings import from_environment
     from app.sources.opening import check_address
 
@@ -77,45 +102,12 @@ def run(arguments: argparse.Namespace) -> int:
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag here and not on the page
 
     from app.dashboard.parameters import ParameterState
-    from app.web.serving import serve
     from app.worker.protocol import Open
 
-    sources = [
-        Open(uri, arguments.odometry, arguments.seed, record=record, publish=arguments.publish)
-        for uri in uris
-    ]
-
-    def make_parameters() -> ParameterState:
-        return ParameterState(lambda suggested: flags.chosen_parameters(arguments, suggested))
-
-    watched = _watched(sources)
-    if watched is not None or len(sources) > 1:
-        from app.fleet import named, serve_fleet
-
-        return serve_fleet(
-            settings,
-            sources={} if watched is not None else named(sources),
-            make_parameters=make_parameters,
-            watched=watched,
-        )
-    return serve(settings, source=sources[0], parameter_state=make_parameters())
-
-
-def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
-    """Return the router whose robots are all shown and how they are opened, if the only source is a Zenoh
-    address with robot=*, or one that names neither a robot nor topics and several robots are found; else
-    None. To find them the router is asked, which takes up to 3 s."""
-    from app.robot.address import ALL_ROBOTS, ZenohAddress, is_live, parse_address
-
-    if len(sources) != 1 or not is_live(sources[0].uri):
-        return None
-    address = parse_address(sources[0].uri)
-    if not isinstance(address, ZenohAddress) or address.robot not in ("", ALL_ROBOTS):
-        return None
-    if address.robot == ALL_ROBOTS:
-        return replace(address, robot=""), sources[0]
-    if address.topics:  # a topic belongs to one robot
-        return None
-    from app.fleet import robots_at
-
-    return (address, sources[0]) if len(robots_at(address)) > 1 else None
+    requests = [flags.source_request(arguments, uri) for uri in uris]
+    sources = [Open(**asdict(each), record=record, publish=arguments.publish) for each in requests]
+    return (
+        settings,
+        sources,
+        lambda: ParameterState(lambda suggested: flags.chosen_parameters(arguments, suggested)),
+    )

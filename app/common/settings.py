@@ -28,11 +28,10 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_FOLDER": "folder for runs, annotations and uploads (default: stemmap in your folder for data)",
     "STEMMAP_FILES": "files that the owner's link may open: any, or folders (only those in the data folders);"
     " default: any for requests from this machine, folders for others; set folders behind a proxy or tunnel",
+    "STEMMAP_EXTENSIONS": "extensions that are switched on, with commas between; empty: none (default: all)",
     "STEMMAP_UPLOAD_GB": "largest recording that a browser may upload, in GB (default: 20)",
 }
 
-#: Folder in the data folder with the results of comparisons, searches and sensitivity curves.
-RESULTS = "results"
 Files = Literal["", "any", "folders"]
 
 #: Largest body of a request that is no upload, and largest websocket message of a browser [bytes].

@@ -7,7 +7,7 @@ import asyncio
 import logging
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from statistics import median
 from typing import Any, Generic, ParamSpec
@@ -207,3 +207,13 @@ class Stopwatch:
         """Dict from the name of each stage to its median time [ms], in the order of their first run; stages
         without a measurement are left out."""
         return {stage: 1e3 * median(times) for stage, times in self._stages.items() if times}
+
+
+async def ended(functions: Iterable[Callable[[], Awaitable[None]]]) -> None:
+    """Call coroutine functions, which end something, one after the other. The exception of one of them is
+    logged, and the others are called."""
+    for function in functions:
+        try:
+            await function()
+        except Exception:  # the code of an extension
+            _log.exception("what an extension has started could not be ended")

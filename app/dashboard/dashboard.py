@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
-from app.common.settings import RESULTS
-from app.common.timers import Throttle
+from app.common.timers import Throttle, ended
 from app.common.user import SOMEBODY, current_user
 from app.dashboard.annotations import AnnotationEditor
 from app.dashboard.broadcast import Broadcast
@@ -26,12 +25,10 @@ from app.dashboard.payload import counts_before, counts_of, map_payload, truth_p
 from app.dashboard.run_recorder import ReviewedRuns, RunRecorder
 from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
-from app.dashboard.shown_run import ShownRun, truth_in_file
+from app.dashboard.shown_run import ShownRun
 from app.sources.opening import check_source
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
-from app.tuning.jobs import RunWithTruth
-from app.tuning.page import Question, Sensitivity, TuneSearch
 from app.worker import protocol
 from pipeline.config import preset
 from pipeline.config.model import Value
@@ -61,7 +58,7 @@ class Dashboard:
         status: Newest status of the worker.
         shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
         seen: Views of the observed area.
-        results: Folder of stored results of sensitivity curves and searches; None if there is no data folder.
+        leaving: Coroutine functions that are called when the run is left, and at the end.
         run: Number of the open run at the worker; None before it is open.
         source, digest: Requested source, and digest (or URI) of the open run, "" before it is open.
     """
@@ -72,13 +69,12 @@ class Dashboard:
     def __init__(self, parameters: ParameterState, live: Broadcast, store: AsyncStore | None = None) -> None:
         self.parameters = parameters
         self.store = store or AsyncStore(None)
-        self.results = self.store.folder and self.store.folder / RESULTS
+        self.leaving: list[Callable[[], Awaitable[None]]] = []
         self.run_recorder, self.reviewed_runs = RunRecorder(self.store), ReviewedRuns(self.store)
         self.annotation_editor = AnnotationEditor(self.store)
         self.annotation_editor.changed, self.annotation_editor.edited = self._use_truth, self._mark_edits
         self.live = live
         self.scores = Scores(self._broadcast_score)
-        self.sensitivity = Sensitivity(lambda state: live.publish("sensitivity", state), kept=self.results)
         self.status = protocol.Status(state="starting", detail="Starting")
         self.shown: protocol.Shown | None = None
         self.path: Path | None = None
@@ -94,7 +90,6 @@ class Dashboard:
         self.source = SourceRequest("")
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
-        self.search = TuneSearch(lambda state: live.publish("search", state))
         self.loop = LoopPlayback(self)
         self.run: int | None = None
         self._notice = ""
@@ -141,11 +136,10 @@ class Dashboard:
         await self.worker.start(self.receive)
 
     async def close(self) -> None:
-        """Write pending records, and end searches, the worker, the store and the scene."""
+        """Write pending records, and end the worker, the store and the scene."""
         self.scores.close()
-        await self.sensitivity.leave()
         self.selector.leave()
-        await self.search.leave()
+        await ended(self.leaving)
         await self.run_recorder.close()
         await self.worker.close()
         self._show_scene.cancel()  # the worker sends no scan any more
@@ -217,7 +211,7 @@ class Dashboard:
                 await self.command(command)
 
     async def _leave_for(self, source: SourceRequest) -> None:
-        """Close the run: end its record, searches and analyses, and remove it from the page. From now on,
+        """Close the run: end its record and what works on it, and remove it from the page. From now on,
         `source` is the source that is expected to open. The worker gets no command."""
         self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self.run, self.source, self.digest = None, source, ""
@@ -225,8 +219,7 @@ class Dashboard:
         self.camera.forget()
         self.run_recorder.leave()
         self.annotation_editor.leave()
-        await self.sensitivity.leave()
-        await self.search.leave()
+        await ended(self.leaving)
         await self._forget()
 
     async def change_parameters(self, changes: dict[str, Value], gesture: str = "") -> None:
@@ -285,25 +278,6 @@ class Dashboard:
         self.parameters.whole = whole
         self._show_parameters()
         await self._send_parameters()
-
-    def how_much_matters(self, name: str, values: list[Value]) -> None:
-        """Start the sensitivity analysis of a parameter: the whole run is scored with each value. The points
-        are broadcast as "sensitivity".
-
-        Args:
-            name: Dotted name of the parameter.
-            values: Values of the parameter, in the order in which they are computed.
-
-        Raises:
-            StemmapError: The run cannot be scored, or name or number of values are invalid; the message has
-                the reason.
-        """
-        run, parameters = self.run_with_truth(), self.parameters.parameters
-        self.sensitivity.ask(Question(run, parameters, name, tuple(values)))
-
-    def run_with_truth(self) -> RunWithTruth:
-        """Return the open run for a search or a sensitivity curve, see `RunWithTruth.shown` for errors."""
-        return RunWithTruth.shown(self.source, self.digest, truth_in_file(self.truth, self.status.cloud))
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree in all views by its number; None clears the selection."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from app.store.async_store import AsyncStore
 from app.store.records import SavedSet, UnknownError
-from pipeline.config import PRESETS, Parameters, field_specs, from_toml, preset, to_toml
+from pipeline.config import OF_ONE_SENSOR, PRESETS, Parameters, field_specs, from_toml, preset, to_toml
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
 
@@ -52,7 +52,7 @@ class ParameterState:
 
     Args:
         begin: Returns preset name and initial parameters for the preset that suits a source. It is called for
-            each source until a person changes a parameter.
+            each source while no change of a person is in force.
         clock: Returns the time [s] from any origin; changes of the same values in quick succession are one
             step.
 
@@ -62,6 +62,7 @@ class ParameterState:
         step: Number of new steps, undos and redos so far.
         whole: Whether a change applies to the whole run, which is then mapped again, or from the current scan
             onwards.
+        suits: Name of the preset that suits the open source.
         check: Called with parameters before they are used; raises a StemmapError if they cannot be used.
     """
 
@@ -71,7 +72,8 @@ class ParameterState:
         self.revision = self.step = 0
         self.whole = True
         self.check: Callable[[Parameters], None] = lambda _: None
-        self._chosen = False
+        self.suits = self.preset
+        self._suited = _Standing(self.preset, self.parameters)
         self._undo: list[_Standing] = []
         self._redo: list[_Standing] = []
         self._gesture = _NO_GESTURE
@@ -161,28 +163,36 @@ class ParameterState:
         self._become(name, preset(name).replace(values))
 
     def suit(self, name: str) -> bool:
-        """Use the preset that suits a source, unless a person has changed a parameter or the preset cannot be
-        used. Return whether anything changed. It is no undo step."""
-        if self._chosen:
-            return False
+        """Use the preset that suits a source, unless a person has chosen the values in force or the preset
+        cannot be used. Return whether `as_plain` differs now. It is no undo step; after an undo or a reset of
+        all changes nothing counts as chosen."""
+        is_other, self.suits = name != self.suits, name
+        if self._suited != (self.preset, self.parameters):
+            return is_other
         try:
             preset_name, parameters = self._begin(name)
             self.check(parameters)
         except StemmapError:  # flags that fitted the default need not fit this one
-            return False
+            return is_other
         if (preset_name, parameters) == (self.preset, self.parameters):
-            return False
-        self.preset, self.parameters = preset_name, parameters
+            return is_other
+        self._suited = _Standing(preset_name, parameters)
+        self.preset, self.parameters = self._suited
+        self._undo.clear()
+        self._redo.clear()
         self.revision += 1
         return True
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state as a dict: `whole`, `preset`, `revision`, `undo` and `redo` (numbers of steps),
-        `values`, a dict from dotted names to values, and `changed`, a list of the names whose values differ
-        from the preset."""
+        """Return the state as a dict: `whole`, `preset`, `unsuited` (the preset that suits the source
+        if the one in force is made for another kind of sensor, else ""), `revision`, `undo` and `redo`
+        (numbers of steps), `values`, a dict from dotted names to values, and `changed`, a list of the names
+        whose values differ from the preset."""
+        is_special = not OF_ONE_SENSOR.isdisjoint({self.suits, self.preset})
         return {
             "whole": self.whole,
             "preset": self.preset,
+            "unsuited": self.suits if self.suits != self.preset and is_special else "",
             "revision": self.revision,
             "undo": len(self._undo),
             "redo": len(self._redo),
@@ -198,7 +208,7 @@ class ParameterState:
 
     def _become(self, preset_name: str, parameters: Parameters, goes_on: bool = False) -> None:
         """Put parameters in force as an undo step, and clear the redo steps. Equal parameters only increase
-        the revision. At most 200 steps are kept. From now on `suit` changes nothing.
+        the revision. At most 200 steps are kept.
 
         Args:
             preset_name: Name of their preset, which is not checked.
@@ -211,7 +221,6 @@ class ParameterState:
         before = _Standing(self.preset, self.parameters)
         self.check(parameters)
         self._gesture = _NO_GESTURE
-        self._chosen = True
         self.revision += 1
         if before == (preset_name, parameters):
             return

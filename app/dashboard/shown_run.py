@@ -28,6 +28,7 @@ from pipeline.io.result_files import (
     REJECTED,
     TERRAIN_COLUMNS,
     TREE_COLUMNS,
+    csv_in_units,
     csv_text,
     number_text,
     path_rows,
@@ -122,7 +123,11 @@ class ShownRun:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
         coordinates of the files."""
         trees = in_file(self.shown.frame.trees, self.cloud)
-        return csv_text(TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews()))
+        return self._in_units(csv_text(TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())))
+
+    def _in_units(self, text: str) -> str:
+        """Return a CSV text with positions in the units of the reference system of the cloud."""
+        return text if self.cloud is None else csv_in_units(text, self.cloud.crs_unit)
 
     @contextmanager
     def folder(self) -> Iterator[FilePath]:
@@ -148,8 +153,8 @@ class ShownRun:
         return {
             "trees.csv": self.trees_text(),
             "path.csv": csv_text(PATH_COLUMNS, path_rows(self.path, self.start_ns)),
-            "seen.csv": seen_text(self._seen_area()),
-            "terrain.csv": csv_text(TERRAIN_COLUMNS, cells),
+            "seen.csv": self._in_units(seen_text(self._seen_area())),
+            "terrain.csv": self._in_units(csv_text(TERRAIN_COLUMNS, cells)),
             "run.json": json.dumps(self._record(), indent=1) + "\n",
         }
 
@@ -166,7 +171,7 @@ class ShownRun:
         """Return the content of run.json as a dict.
 
         The keys are `stemmap` (version); `source`, a dict with `uri`, `kind`, `sha256` ("" if the recording
-        has no digest) and, for a whole cloud, `offset_m` and `crs` (None if unknown); `recorded` and `chosen`
+        has no digest) and, for a whole cloud, those of `app.batch.map_cloud`; `recorded` and `chosen`
         where known; `seed`, `odometry`, `preset`, `changed` and `parameters`; `scans` (0 for a whole cloud),
         `duration_s` and `distance_m`; `trees`, without the rejected ones, and `rejected`, their number;
         `evaluation`, which reviews do not change, None without ground truth; and those of `_counts`."""
@@ -180,6 +185,9 @@ class ShownRun:
         source: dict[str, Any] = {"uri": self.request.uri, "kind": status.kind, "sha256": digest}
         if self.cloud is not None:
             source |= {"offset_m": list(self.cloud.offset), "crs": self.cloud.crs or None}
+            source |= {"unit": self.cloud.unit, "up": self.cloud.up}
+            if self.cloud.crs_unit != (1.0, 1.0):
+                source["crs_unit_m"] = list(self.cloud.crs_unit)
         return {
             "stemmap": version(),
             "source": source,

@@ -218,6 +218,7 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, all_around:
         by_votes=verdict in _decided_by(share, parameters.classification.tree_share),
         present=int(columns.present[row]),
         absent=int(columns.absent[row]),
+        absent_lately=int(columns.absent_lately[row]),
         viewed=float(columns.viewed[row]),
         effects=[
             FeatureEffect(NAMES[k], float(figures[k]), float(effect[k]))
@@ -441,7 +442,7 @@ def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
     place = plot.place[row]
     tree = np.flatnonzero(plot.tree_candidate == row)
     detection = run.parameters_at(0).detection
-    checks = stem_checks(plot.stems, plot.share, detection.radius_min, detection.radius_max)
+    checks = stem_checks(plot.stems, plot.share, detection.radius_min, detection.cloud_radius_max)
     return ClusterStory(
         scan=0,
         cluster=row,

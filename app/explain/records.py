@@ -80,6 +80,7 @@ class ColumnStory(msgspec.Struct, frozen=True):
         by_votes: Whether the votes decided the verdict; otherwise a rule did.
         present, absent: Number of accumulated scans with a clear view of the position that show it occupied,
             and that show it empty.
+        absent_lately: Number of the last of these scans without a break that show it empty.
         viewed: Maximum height above ground that any scan observed there [m].
         effects: The most influential features, at most six, the strongest first; none without an effect.
     """
@@ -92,6 +93,7 @@ class ColumnStory(msgspec.Struct, frozen=True):
     by_votes: bool
     present: int
     absent: int
+    absent_lately: int
     viewed: float
     effects: list[FeatureEffect]
 

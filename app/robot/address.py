@@ -1,33 +1,31 @@
 """The address of a live source: `zenoh:tcp/host:7447?robot=NAME&domain=0&scan=/topic`,
-`zenoh:tls/host:7447?ca=ca.pem&cert=me.pem&key=me-key.pem`, `dds:?domain=0&interface=192.168.1.10`, or
-`velodyne:0.0.0.0:2368?from=192.168.1.201`."""
+`zenoh:tls/host:7447?ca=ca.pem&cert=me.pem&key=me-key.pem`, `velodyne:0.0.0.0:2368?from=192.168.1.201`, or one
+of an extension."""
 
 from __future__ import annotations
 
 import ipaddress
 import re
 from dataclasses import dataclass, field
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import ClassVar
 from urllib.parse import parse_qsl
 
+from app.extension import extensions_on
 from pipeline.errors import SourceError
 
 #: Value of `?robot=` for all robots, each with a dashboard.
 ALL_ROBOTS = "*"
 #: Value of `?robot=` for the robot without a namespace (ROS's root namespace).
 ROOT = "/"
-SCHEME, VELODYNE, DDS = "zenoh:", "velodyne:", "dds:"
+SCHEME, VELODYNE = "zenoh:", "velodyne:"
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})")
 _FILES = ("ca", "cert", "key")
-_TOPICS = ("scan", "odometry", "imu", "gnss", "pose", "camera")
-_OPTIONS = ("robot", "domain", *_TOPICS, *_FILES)
-_DDS_OPTIONS = ("domain", "interface", "peer", "robot", *_TOPICS)
-#: Network interfaces (IPv4 address or name) and hosts, without characters that could change a configuration.
-_INTERFACE = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,14}|[0-9]{1,3}(\.[0-9]{1,3}){3}")
-_HOST = re.compile(r"[A-Za-z0-9][A-Za-z0-9.-]{0,252}")
-_DDS_REMEDY = "An address looks like dds:?domain=0&interface=192.168.1.10, with &peer=HOST where needed."
+#: Roles for which an address may name a topic.
+TOPICS = ("scan", "odometry", "imu", "gnss", "pose", "camera")
+_OPTIONS = ("robot", "domain", *TOPICS, *_FILES)
 _VELODYNE_REMEDY = (
     "Name where to listen and the sensor's own address: velodyne:0.0.0.0:2368?from=192.168.1.201"
 )
@@ -69,20 +67,6 @@ class ZenohAddress(Address):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DdsAddress(Address):
-    """Address of a robot on plain DDS, without a router.
-
-    Attributes:
-        interface: Network interface of this machine, by name or address; "" for loopback.
-        peers: Hosts that are contacted where the network has no multicast.
-    """
-
-    kind: ClassVar[str] = "ROS 2 over DDS"
-    interface: str = ""
-    peers: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class VelodyneAddress(Address):
     """Address at which the packets of a sensor arrive.
 
@@ -98,9 +82,23 @@ class VelodyneAddress(Address):
 
 
 def is_live(uri: str) -> bool:
-    """Return whether a URI is the address of a live source: whether it begins with one of the three schemes,
-    in any case. It is not checked further."""
-    return uri.lower().startswith((SCHEME, VELODYNE, DDS))
+    """Return whether a URI is the address of a live source: whether it begins with one of the schemes, in any
+    case. It is not checked further."""
+    return uri.lower().startswith((SCHEME, VELODYNE)) or _module_of(uri) != ""
+
+
+def extension_of(uri: str) -> ModuleType | None:
+    """Return the module of the extension that reads a URI, see `app.extension.Extension.addresses`; None if
+    there is none."""
+    module = _module_of(uri)
+    return import_module(module) if module else None
+
+
+def _module_of(uri: str) -> str:
+    """Return the name of the module of `extension_of`; "" for none."""
+    scheme = uri.partition(":")[0].lower()
+    found = (each.addresses[scheme] for each in extensions_on().values() if scheme in each.addresses)
+    return next(found, "")
 
 
 def parse_address(uri: str) -> Address:
@@ -108,35 +106,12 @@ def parse_address(uri: str) -> Address:
 
     Raises:
         SourceError: The address is invalid or has an unknown option, a certificate file does not exist, or
-            plain DDS is not installed.
+            what an extension needs is not installed.
     """
-    if uri.lower().startswith(DDS):
-        return _dds(uri)
+    if (extension := extension_of(uri)) is not None:
+        address: Address = extension.parse(uri)
+        return address
     return _velodyne(uri) if uri.lower().startswith(VELODYNE) else _zenoh(uri)
-
-
-def _dds(uri: str) -> DdsAddress:
-    """Parse an address of plain DDS; errors as in `parse_address`. The robot "/" becomes "": all topics.
-    `peer` is a list of hosts separated by commas."""
-    place, _, query = uri[len(DDS) :].partition("?")
-    if place:
-        raise SourceError("plain DDS has no address, only options after ?", where=uri, remedy=_DDS_REMEDY)
-    options = _known(uri, query, _DDS_OPTIONS)
-    interface = options.get("interface", "")
-    peers = tuple(peer for peer in options.get("peer", "").split(",") if peer)
-    if (interface and not _INTERFACE.fullmatch(interface)) or not all(map(_HOST.fullmatch, peers)):
-        raise SourceError("the interface or a peer is invalid", where=uri, remedy=_DDS_REMEDY)
-    if find_spec("cyclonedds") is None:
-        remedy = "Install it with: uv sync --extra dds"
-        raise SourceError("plain DDS needs cyclonedds", where=uri, remedy=remedy)
-    return DdsAddress(
-        uri=uri,
-        domain=_domain(uri, options),
-        robot=options.get("robot", "").strip("/"),
-        topics=_topics(options),
-        interface=interface,
-        peers=peers,
-    )
 
 
 def _velodyne(uri: str) -> VelodyneAddress:
@@ -177,21 +152,21 @@ def _zenoh(uri: str) -> ZenohAddress:
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None or not 0 < int(found.group(3)) < 1 << 16:
         raise SourceError("this is not the address of a Zenoh router", where=uri, remedy=_REMEDY)
-    options = _known(uri, query, _OPTIONS)
+    options = known_options(uri, query, _OPTIONS)
     files = _files(uri, endpoint, {name: options[name] for name in _FILES if options.get(name)})
     named = options.get("robot", "")
     robot = named.strip("/") or (ROOT if named else "")
     return ZenohAddress(
         uri=uri,
-        domain=_domain(uri, options),
+        domain=domain_of(uri, options),
         robot=robot,
-        topics=_topics(options),
+        topics=topics_of(options),
         endpoint=endpoint,
         files=files,
     )
 
 
-def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
+def known_options(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
     """Return a dict from the names of the options of an address to their values, also empty ones; of a
     repeated option the last value counts.
 
@@ -211,7 +186,7 @@ def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
     return options
 
 
-def _domain(uri: str, options: dict[str, str]) -> int:
+def domain_of(uri: str, options: dict[str, str]) -> int:
     """Return the ROS domain of the options, by default 0; SourceError unless it is 0 to 232."""
     domain = options.get("domain", "0")
     if not (domain.isascii() and domain.isdigit() and int(domain) <= 232):
@@ -219,9 +194,9 @@ def _domain(uri: str, options: dict[str, str]) -> int:
     return int(domain)
 
 
-def _topics(options: dict[str, str]) -> dict[str, str]:
+def topics_of(options: dict[str, str]) -> dict[str, str]:
     """Return a dict from each role for which the user named a topic to this topic."""
-    return {role: options[role] for role in _TOPICS if options.get(role)}
+    return {role: options[role] for role in TOPICS if options.get(role)}
 
 
 def _files(uri: str, endpoint: str, named: dict[str, str]) -> dict[str, str]:

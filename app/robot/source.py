@@ -13,13 +13,12 @@ from typing import Any
 from app.robot.address import (
     ALL_ROBOTS,
     Address,
-    DdsAddress,
     VelodyneAddress,
     ZenohAddress,
+    extension_of,
     is_live,
     parse_address,
 )
-from app.robot.dds import DdsLink
 from app.robot.link import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox, Link
 from app.robot.recorder import Recorder
 from app.robot.topics import SCAN_TYPES, Choice, choose
@@ -111,10 +110,11 @@ MakeLink = Callable[[Any, Inbox], Link]
 
 
 def link_for(address: Address) -> MakeLink:
-    """Return the class of the connection for an address: VelodyneLink, DdsLink or ZenohLink."""
-    if isinstance(address, VelodyneAddress):
-        return VelodyneLink
-    return DdsLink if isinstance(address, DdsAddress) else ZenohLink
+    """Return what connects to an address: VelodyneLink, ZenohLink, or the function of an extension."""
+    if (extension := extension_of(address.uri)) is not None:
+        connect: MakeLink = extension.connect
+        return connect
+    return VelodyneLink if isinstance(address, VelodyneAddress) else ZenohLink
 
 
 #: The nodes of a robot start one after another: topics are chosen this long after the first scan topic [s].

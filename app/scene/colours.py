@@ -49,6 +49,7 @@ _VERDICTS: dict[Verdict, Rgb] = {
     Verdict.NO_ARC: UNCERTAIN,
     Verdict.AT_BORDER: UNCERTAIN,
     Verdict.HIDDEN: UNCERTAIN,
+    Verdict.STUMP: OTHER,
 }
 _BY_VERDICT: Colours = np.array([_VERDICTS.get(verdict, OTHER) for verdict in Verdict], dtype=np.uint8)
 

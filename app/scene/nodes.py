@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-import trimesh
 import viser
 from numpy.typing import NDArray
 
@@ -31,20 +30,31 @@ Points = NDArray[np.floating]
 Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
 
 
-def cylinder() -> Mesh:
-    """Return a closed cylinder of radius 1 and height 1 whose base is centred on the origin."""
-    return _mesh(trimesh.creation.cylinder(radius=1.0, height=1.0, sections=20), (0.0, 0.0, 0.5))
+def cylinder(sides: int = 20) -> Mesh:
+    """Return a closed cylinder of radius 1 and height 1 whose base is centred on the origin: vertices,
+    float32, shape (V, 3), and faces, uint32, shape (F, 3), counter-clockwise from outside."""
+    angle = np.arange(sides) * (2.0 * math.pi / sides)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(sides)])
+    vertices = np.vstack([ring, ring + np.array([0.0, 0.0, 1.0]), [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]])
+    here, there = np.arange(sides), np.roll(np.arange(sides), -1)
+    bottom, top = np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
+    faces = np.vstack(
+        [
+            np.column_stack([here, there, there + sides]),
+            np.column_stack([here, there + sides, here + sides]),
+            np.column_stack([there, here, bottom]),
+            np.column_stack([here + sides, there + sides, top]),
+        ]
+    )
+    return vertices.astype(np.float32), faces.astype(np.uint32)
 
 
 def box() -> Mesh:
-    """Return a cube of side 1 with a corner at the origin."""
-    return _mesh(trimesh.creation.box(extents=(1.0, 1.0, 1.0)), (0.5, 0.5, 0.5))
-
-
-def _mesh(shape: trimesh.Trimesh, moved: tuple[float, float, float]) -> Mesh:
-    """Return vertices, float32, shape (V, 3), and faces, uint32, shape (F, 3), of a shape that is moved by an
-    offset."""
-    return (shape.vertices + moved).astype(np.float32), shape.faces.astype(np.uint32)
+    """Return a cube of side 1 with a corner at the origin, in the form of `cylinder`."""
+    vertices = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
+    squares = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    faces = [corners for a, b, c, d in squares for corners in ((a, b, c), (a, c, d))]
+    return vertices, np.array(faces, np.uint32)
 
 
 def placed(points: Points, pose: Pose2, z: float) -> NDArray[np.float32]:

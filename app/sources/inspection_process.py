@@ -20,10 +20,10 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
-from app.sources.opening import MEMORY_LIMIT, open_cloud, open_source
+from app.sources.opening import MEMORY_LIMIT, is_cloud, open_cloud, open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
+from app.sources.topic_details import topic_details
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers import is_cloud
 from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.topics import TYPES_BY_ROLE
 from pipeline.odometry.synchroniser import steps
@@ -354,9 +354,9 @@ _ROLES = {kind: role for role, kinds in reversed(TYPES_BY_ROLE.items()) for kind
 
 def recorded(uri: str) -> dict[str, Any]:
     """Return the description of a file, folder or simulated run as a dict: `kind`, the format; `topics`, a
-    list of at most MOST_TOPICS dicts with the fields of `RecordedTopic` and `rate_hz`; `mount`, [x, y, z [m],
+    list of at most MOST_TOPICS dicts with the fields of `RecordedTopic` and `details`; `mount`, [x, y, z [m],
     roll, pitch, yaw [deg]] of the LiDAR on the robot (None if there are no topics); and `warnings`, at most
-    20 strings.
+    20 strings, with what is missing.
 
     Raises:
         SourceError: The source cannot be read, or is a whole cloud.
@@ -368,14 +368,21 @@ def recorded(uri: str) -> dict[str, Any]:
         known = about.start_ns is not None and about.end_ns is not None
         seconds = 1e-9 * ((about.end_ns or 0) - (about.start_ns or 0)) if known else 0.0
         shown = about.topics[:MOST_TOPICS]
-        topics = [{**asdict(topic), "rate_hz": _rate(topic.messages, seconds)} for topic in shown]
+        topics = [
+            {
+                **asdict(topic),
+                "rate_hz": topic.rate_hz or _rate(topic.messages, seconds),
+                "details": topic_details(topic),
+            }
+            for topic in shown
+        ]
         mounted = about.T_base_lidar
         place = [*map(float, mounted.t), *map(degrees, mounted.euler())]
         return {
             "kind": about.kind,
             "topics": topics,
             "mount": [round(number, 3) + 0.0 for number in place] if about.topics else None,
-            "warnings": list(about.warnings)[:20],
+            "warnings": [*about.warnings, *(f"Missing: {text}" for text in about.missing)][:20],
         }
 
 
@@ -422,7 +429,7 @@ def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, An
         why = f"silent for {COUNT_S:g} s"
     topic = RecordedTopic(publisher.topic, publisher.msgtype, 0, "", _ROLES.get(publisher.msgtype, ""), why)
     counted = heard.messages if listened else None
-    return {**asdict(topic), "messages": counted, "seconds": COUNT_S, "rate_hz": heard.rate_hz}
+    return {**asdict(topic), "details": [], "messages": counted, "seconds": COUNT_S, "rate_hz": heard.rate_hz}
 
 
 def _rate(messages: int, seconds: float) -> float | None:

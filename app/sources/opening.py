@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import ctypes
 import faulthandler
+import logging
 import os
 import select
 import signal
@@ -26,17 +27,44 @@ from weakref import WeakKeyDictionary
 import msgspec
 
 from app.common.child_process import ChildError, ChildProcess, ProtocolError, python_module
+from app.extension import extensions_on
 from app.robot.address import is_live, parse_address
 from app.sources.request import SourceRequest
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers import Source, SourceOptions, check_existence, is_cloud, path_of
+from pipeline.io.readers import (
+    Source,
+    SourceOptions,
+    add_formats,
+    check_existence,
+    path_of,
+    points_format,
+)
+from pipeline.io.readers import is_cloud as _is_cloud
 from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
 
 if TYPE_CHECKING:
+    from pipeline.io.readers import Format
     from pipeline.types.records import WholeCloud
 
+_log = logging.getLogger(__name__)
 
+
+def _formats_of_extensions() -> list[Format]:
+    """Return the formats of the extensions that are switched on. Those of an extension that fails to name
+    them are left out, and this is logged."""
+    found: list[Format] = []
+    for name, extension in extensions_on().items():
+        if extension.formats is not None:
+            try:
+                found += extension.formats()
+            except Exception:  # the code of others: other files can be opened without it
+                _log.exception("the formats of the extension %s are left out", name)
+    return found
+
+
+# Each process that opens files imports this module.
+add_formats(_formats_of_extensions)
 _PR_SET_PDEATHSIG = 1
 _DAMAGED = "The file is damaged, or this is a fault in stemmap"
 
@@ -62,8 +90,9 @@ class ProcessLimits:
         return cls((512 << 20) + 2 * size, 6 + size // 4_000_000, 60.0 + size / 5_000_000)
 
 
-def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -> None:
-    """Run a function in a copy of this process, which is killed at its limits; its result is discarded.
+def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -> bool | None:
+    """Run a function in a copy of this process, which is killed at its limits. Return its result if that is a
+    bool, else None.
 
     The copy has only the calling thread: the function must not wait for other threads. It is available on
     Linux; on other systems nothing is run.
@@ -78,7 +107,7 @@ def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -
             ended without an answer, as after any other exception.
     """
     if sys.platform != "linux":
-        return
+        return None
     receiving, sending = os.pipe()
     child = os.fork()
     if child == 0:
@@ -97,10 +126,13 @@ def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -
         slow = os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL)
         what = "it takes too long to be read" if slow else "the reader ended without an answer"
         raise SourceError(what, where=where, remedy=_DAMAGED)
-    error = msgspec.json.decode(answer, type=tuple[str, str, str] | None)
-    if error is not None:
-        what, place, remedy = error
+    told: tuple[str, str, str] | bool | None = msgspec.json.decode(
+        answer, type=tuple[str, str, str] | bool | None
+    )
+    if isinstance(told, tuple):
+        what, place, remedy = told
         raise SourceError(what, where=place, remedy=remedy)
+    return told
 
 
 def _answer(receiving: int, wall_s: float) -> bytes | None:
@@ -116,8 +148,8 @@ def _answer(receiving: int, wall_s: float) -> bytes | None:
 
 
 def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sending: int) -> NoReturn:
-    """Run the function in the copy with its limits, write its error as JSON (null without one), and end the
-    copy; nothing is written after exceptions other than StemmapError and MemoryError.
+    """Run the function in the copy with its limits, write its error or its result (a bool, else null) as
+    JSON, and end the copy; nothing is written after exceptions other than StemmapError and MemoryError.
 
     Args:
         work, limits, where: As in `run_limited`.
@@ -125,7 +157,7 @@ def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sen
     """
     import resource
 
-    error: tuple[str, str, str] | None = None
+    told: tuple[str, str, str] | bool | None = None
     try:
         faulthandler.disable()
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
@@ -138,14 +170,15 @@ def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sen
         cpu_s = int(used_s.ru_utime + used_s.ru_stime) + limits.cpu_s
         resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 1))
         resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + limits.memory,) * 2)
-        work()
+        result = work()
+        told = result if isinstance(result, bool) else None
     except StemmapError as raised:
-        error = raised.what, raised.where, raised.remedy
+        told = raised.what, raised.where, raised.remedy
     except MemoryError:
-        error = "it takes more memory than a file of its size should", where, _DAMAGED
+        told = "it takes more memory than a file of its size should", where, _DAMAGED
     except BaseException:
         os._exit(1)
-    os.write(sending, msgspec.json.encode(error))
+    os.write(sending, msgspec.json.encode(told))
     os._exit(0)
 
 
@@ -182,14 +215,28 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     Raises:
         SourceError: The source cannot be read, or takes more time or memory than a file of its size should.
     """
-    if is_cloud(uri):
-        open_cloud(uri)
+    if is_cloud(uri, options):
+        open_cloud(uri, options)
     else:
         _check(lambda: _open_source(uri, options).truth(), uri)
     return _open_source(uri, options)
 
 
-def open_cloud(uri: str) -> WholeCloud:
+def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
+    """Return whether a file is a whole cloud, see `pipeline.io.readers.is_cloud`; where its contents decide,
+    on Linux in a child process with limits. Of a file that cannot be read or takes too long, its format
+    decides."""
+    kind = points_format(uri)
+    if kind is None or not kind.is_told_by_contents or (options is not None and options.form != "auto"):
+        return _is_cloud(uri, options)
+    try:
+        found = _check(lambda: _is_cloud(uri, options), uri)
+    except SourceError:
+        return kind.is_cloud
+    return _is_cloud(uri, options) if found is None else found
+
+
+def open_cloud(uri: str, options: SourceOptions | None = None) -> WholeCloud:
     """Open a whole cloud, see `pipeline.io.readers.clouds.open_cloud`; on Linux first in a child process with
     limits.
 
@@ -198,11 +245,11 @@ def open_cloud(uri: str) -> WholeCloud:
     """
     from pipeline.io.readers.clouds import open_cloud as _open_cloud
 
-    _check(lambda: _open_cloud(uri), uri)
-    return _open_cloud(uri)
+    _check(lambda: _open_cloud(uri, options), uri)
+    return _open_cloud(uri, options)
 
 
-def check_cloud(uri: str) -> None:
+def check_cloud(uri: str, options: SourceOptions | None = None) -> None:
     """Check that a whole cloud can be opened, in a child process with limits of time and memory. Nothing is
     checked on systems other than Linux, or if the path does not exist.
 
@@ -211,15 +258,14 @@ def check_cloud(uri: str) -> None:
     """
     from pipeline.io.readers.clouds import open_cloud as _open_cloud
 
-    _check(lambda: _open_cloud(uri), uri)
+    _check(lambda: _open_cloud(uri, options), uri)
 
 
-def _check(opening: Callable[[], object], uri: str) -> None:
+def _check(opening: Callable[[], object], uri: str) -> bool | None:
     """Run an opening with limits, see `run_limited`, if the source is a file or a folder; otherwise do
-    nothing. Raises SourceError if it fails or exceeds its limits."""
+    nothing. Return its result if it is a bool. Raises SourceError if it fails or exceeds its limits."""
     size = _size(uri)
-    if size is not None:
-        run_limited(opening, ProcessLimits.for_size(size), uri)
+    return None if size is None else run_limited(opening, ProcessLimits.for_size(size), uri)
 
 
 def _size(uri: str) -> int | None:
@@ -302,8 +348,9 @@ async def check_source(request: SourceRequest) -> None:
     """
     if not check_address(request.uri):
         return
-    if await asyncio.to_thread(is_cloud, request.uri):
-        await asyncio.to_thread(check_cloud, request.uri)  # a copy of this process, which starts at once
+    options = request.options()
+    if await asyncio.to_thread(is_cloud, request.uri, options):
+        await asyncio.to_thread(check_cloud, request.uri, options)  # a copy of this process: starts at once
     else:
         question = {"ask": "first_scan", "path": request.uri, "request": msgspec.to_builtins(request)}
         await ask(question, patience_s=OPENING_LIMIT_S)

@@ -19,7 +19,6 @@ from pipeline.io.readers import Source
 from pipeline.io.readers.base import SourceDescription, SourceOptions
 from pipeline.odometry.odometry_override import (
     FileOdometry,
-    LidarOdometry,
     OdometryEstimator,
     OdometryOverride,
 )
@@ -34,6 +33,9 @@ TopicName = Annotated[str, Meta(max_length=256)]
 Seed = Annotated[int, Meta(ge=0, le=LARGEST_SEED)]
 _Number = Annotated[float, Meta(ge=-1000.0, le=1000.0)]
 Mount = tuple[_Number, _Number, _Number, _Number, _Number, _Number]
+FormChoice = Literal["auto", "scan", "cloud"]
+UnitChoice = Literal["auto", "m", "cm", "mm", "ft", "us-ft"]
+UpChoice = Literal["auto", "z", "y", "-y", "x", "-x", "-z"]
 _Value = bool | int | float | Annotated[str, Meta(max_length=100)]
 
 
@@ -42,7 +44,7 @@ class SourceRequest(msgspec.Struct, frozen=True):
 
     Attributes:
         uri: Path or address of the source, as the user wrote it.
-        odometry: "auto", "wheels", "kiss-icp", "static", or "file:" and a path, see `choose_odometry`.
+        odometry: "auto", "wheels", "lidar", "static", or "file:" and a path, see `choose_odometry`.
         seed: Random seed of the mapping and of a simulated source.
         topics: Dict from each role for which the user chose a topic to its name; other topics are chosen by
             type.
@@ -50,6 +52,7 @@ class SourceRequest(msgspec.Struct, frozen=True):
             the source declares.
         preset: Name of the parameter preset; empty for the preset that suits the source.
         parameters: Dict from dotted names to the parameter values that differ from the preset.
+        form, unit, up: Of a file of points, see `SourceOptions`.
     """
 
     uri: Uri
@@ -59,6 +62,9 @@ class SourceRequest(msgspec.Struct, frozen=True):
     mount: Mount | None = None
     preset: Annotated[str, Meta(max_length=100)] = ""
     parameters: dict[str, _Value] = {}
+    form: FormChoice = "auto"
+    unit: UnitChoice = "auto"
+    up: UpChoice = "auto"
 
     def request(self) -> SourceRequest:
         """Return these fields as a plain `SourceRequest`, without the fields of a subclass."""
@@ -68,18 +74,29 @@ class SourceRequest(msgspec.Struct, frozen=True):
     def options(self) -> SourceOptions:
         """Return the options with which the readers open the source."""
         mounted = None if self.mount is None else Pose3.from_euler(self.mount[:3], *self.mount[3:])
-        return SourceOptions(dict(self.topics), mounted, self.seed)
+        return SourceOptions(
+            dict(self.topics), mounted, self.seed, form=self.form, unit=self.unit, up=self.up
+        )
+
+    def _points_choices(self) -> dict[str, str]:
+        """Return the fields `form`, `unit` and `up` that are not "auto"."""
+        chosen = {"form": self.form, "unit": self.unit, "up": self.up}
+        return {name: value for name, value in chosen.items() if value != "auto"}
 
     def kept_choices(self) -> dict[str, Any] | None:
-        """Return a dict for the store and run.json with `topics`, a dict from roles to names, and `mount`,
-        [x, y, z [m], roll, pitch, yaw [rad]] or None; None if neither was chosen."""
-        if not self.topics and self.mount is None:
+        """Return a dict for the store and run.json with `topics`, a dict from roles to names, `mount`, [x, y,
+        z [m], roll, pitch, yaw [rad]] or None, and those of `form`, `unit` and `up` that were chosen; None if
+        nothing was chosen."""
+        of_points = self._points_choices()
+        if not self.topics and self.mount is None and not of_points:
             return None
-        return {"topics": dict(self.topics), "mount": None if self.mount is None else list(self.mount)}
+        mount = None if self.mount is None else list(self.mount)
+        return {"topics": dict(self.topics), "mount": mount, **of_points}
 
     def for_page(self) -> dict[str, Any]:
-        """Return a dict as `POST /api/open` takes it: `uri`, `odometry`, `seed`, `topics` and `mount`, [x, y,
-        z [m], roll, pitch, yaw [deg]] or None. Preset and parameters are left out."""
+        """Return a dict as `POST /api/open` takes it: `uri`, `odometry`, `seed`, `topics`, `mount`, [x, y, z
+        [m], roll, pitch, yaw [deg]] or None, and those of `form`, `unit` and `up` that were chosen. Preset
+        and parameters are left out."""
         mount = None if self.mount is None else [*self.mount[:3], *map(degrees, self.mount[3:])]
         return {
             "uri": self.uri,
@@ -87,14 +104,18 @@ class SourceRequest(msgspec.Struct, frozen=True):
             "seed": self.seed,
             "topics": dict(self.topics),
             "mount": None if mount is None else [round(value, 9) + 0.0 for value in mount],
+            **self._points_choices(),
         }
 
 
 class _KeptChoices(msgspec.Struct, frozen=True):
-    """Topics and mounting as `SourceRequest.kept_choices` writes them."""
+    """Choices as `SourceRequest.kept_choices` writes them."""
 
     topics: dict[Role, TopicName] = {}
     mount: Mount | None = None
+    form: FormChoice = "auto"
+    unit: UnitChoice = "auto"
+    up: UpChoice = "auto"
 
 
 def request_of_kept(
@@ -120,7 +141,18 @@ def request_of_kept(
         except msgspec.ValidationError:
             kept = _KeptChoices()
     topics = {str(role): name for role, name in kept.topics.items()}
-    return SourceRequest(uri, odometry, seed, topics, kept.mount, preset, dict(parameters or {}))
+    return SourceRequest(
+        uri,
+        odometry,
+        seed,
+        topics,
+        kept.mount,
+        preset,
+        dict(parameters or {}),
+        form=kept.form,
+        unit=kept.unit,
+        up=kept.up,
+    )
 
 
 def mount_of_degrees(mount: tuple[float, float, float, float, float, float] | None) -> Mount | None:
@@ -133,7 +165,7 @@ def mount_of_degrees(mount: tuple[float, float, float, float, float, float] | No
 
 
 FILE = "file:"
-Method = Literal["source", "kiss-icp", "static", "file"]
+Method = Literal["source", "lidar", "static", "file"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,15 +192,15 @@ def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
     """Return the source of motion for a choice of the user.
 
     "auto", and any unknown choice, selects the odometry of the source; without it, registration of the scans
-    (KISS-ICP); and where that is impossible, for example with a planar laser, no motion, with a warning. A
-    pose file is not opened here.
+    (LiDAR odometry); and where that is impossible, for example with a planar laser, no motion, with a
+    warning. A pose file is not opened here.
 
     Args:
         known: Description of the source.
-        choice: "auto", "wheels", "kiss-icp", "static", or "file:" and a path.
+        choice: "auto", "wheels", "lidar", "static", or "file:" and a path.
 
     Raises:
-        SourceError: "wheels" is chosen and the source has no odometry, or "kiss-icp" and its scans cannot be
+        SourceError: "wheels" is chosen and the source has no odometry, or "lidar" and its scans cannot be
             registered.
     """
     if choice.startswith(FILE):
@@ -180,14 +212,14 @@ def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
         raise SourceError(
             "the source has no odometry",
             where=known.uri,
-            remedy="--odometry kiss-icp computes the motion from the scans; --odometry static assumes none",
+            remedy="--odometry lidar computes the motion from the scans; --odometry static assumes none",
         )
     obstacle = _no_matching(known)
-    if choice == "kiss-icp":
+    if choice == "lidar":
         if obstacle:
             raise SourceError(f"LiDAR odometry is not possible: {obstacle}", where=known.uri)
         wheels = ", started from the wheel odometry" if known.has_odometry else ""
-        return ChosenOdometry("kiss-icp", f"registration of the scans (kiss-icp){wheels}, as requested")
+        return ChosenOdometry("lidar", f"registration of the scans{wheels}, as requested")
     if known.has_odometry:
         gnss = f"; GNSS {known.gnss}" if known.gnss else ""
         gnss += f"; other SLAM: {known.other_slam}" if known.other_slam else ""
@@ -197,9 +229,7 @@ def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
     if obstacle:
         warning = f"the source has no odometry, and {obstacle}: the robot is mapped without motion"
         return ChosenOdometry("static", f"none: {obstacle}", warning)
-    return ChosenOdometry(
-        "kiss-icp", "registration of the scans (kiss-icp), because the source has no odometry"
-    )
+    return ChosenOdometry("lidar", "registration of the scans, because the source has no odometry")
 
 
 def _no_matching(known: SourceDescription) -> str:
@@ -223,8 +253,10 @@ def motion_of(known: SourceDescription, choice: str, chosen: ChosenOdometry) -> 
     Raises:
         SourceError: A pose file cannot be read.
     """
-    if chosen.method == "kiss-icp":
-        return LidarOdometry(known.T_base_lidar)
+    if chosen.method == "lidar":
+        from pipeline.odometry.lidar_odometry import LidarOdometry  # the web process starts without Numba
+
+        return LidarOdometry(known.T_base_lidar, known.sensor)
     if chosen.method == "file":
         return FileOdometry(Path(choice.removeprefix(FILE)).expanduser(), known.T_base_lidar)
     return None

@@ -12,45 +12,25 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.errors import StemmapError
 
-# Version of the tables, in a table that keeps the name under which Alembic reads it.
-VERSION = "0007"
-# Columns that earlier versions do not have yet, by their version; they are added to their databases.
-_ADDED = {
-    "0005": ("annotations ADD COLUMN plot JSON", "run_maps ADD COLUMN files BLOB"),
-    "0006": ("run_records ADD COLUMN lost FLOAT",),
-}
-_version = sa.Table(
-    "alembic_version", sa.MetaData(), sa.Column("version_num", sa.String(32), primary_key=True)
-)
+# Version of the tables, in the header of the file (PRAGMA user_version).
+VERSION = 8
 
 
 def _prepare_tables(connection: sa.Connection) -> None:
-    """Create the tables of an empty database and store VERSION. To a database of a version in `_ADDED`, add
-    the columns of that version and of all later ones, and store VERSION. A database of VERSION is unchanged.
+    """Create the tables of an empty database and store VERSION.
 
     Raises:
-        StemmapError: The tables are of any other version, or of another program.
+        StemmapError: The tables are of another version or of another program.
     """
-    names = sa.inspect(connection).get_table_names()
-    if not names:
+    version = int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
+    if not version and not sa.inspect(connection).get_table_names():
         metadata.create_all(connection)
-        _version.create(connection)
-        connection.execute(sa.insert(_version).values(version_num=VERSION))
-        return
-    if _version.name not in names:
-        raise StemmapError("this database belongs to another program")
-    version = str(connection.execute(sa.select(_version.c.version_num)).scalar())
-    if version in _ADDED:
-        for since, columns in _ADDED.items():
-            for column in columns if since >= version else ():
-                connection.execute(sa.text(f"ALTER TABLE {column}"))
-        connection.execute(sa.update(_version).values(version_num=VERSION))
-        return
-    if version != VERSION:
-        author = "a newer stemmap" if version > VERSION else "an older stemmap"
+        connection.exec_driver_sql(f"PRAGMA user_version = {VERSION}")
+    elif version != VERSION:
+        author = "a newer" if version > VERSION else "another program or an older"
         raise StemmapError(
-            f"it was written by {author} (tables {version}, this one reads {VERSION})",
-            remedy="Start that version",
+            f"it was written by {author} stemmap (tables {version}, this one reads {VERSION})",
+            remedy="Move the file away to start with an empty one",
         )
 
 
@@ -59,8 +39,7 @@ _PATIENCE_MS = 5000
 
 
 def open_engine(folder: Path | None) -> sa.Engine:
-    """Return the engine of a database with current tables. Tables of the versions in `_ADDED` get the new
-    columns.
+    """Return the engine of a database with current tables.
 
     Args:
         folder: Folder of the SQLite file, created if necessary; None keeps the database in memory.

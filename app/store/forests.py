@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 FOLDER = "forests"
 #: Name of the forest of the package, the default of the parameter.
 PACKAGE = Parameters().classification.forest
-#: Annotated trees and other objects that a training needs.
-LEAST_TREES, LEAST_OTHERS = 10, 5
 _NAME = re.compile(r"[0-9a-f]{16}")
 
 

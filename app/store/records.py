@@ -38,7 +38,7 @@ class UnknownError(StemmapError):
 
 
 class NoFilesError(StemmapError):
-    """The run was recorded by an earlier version, without its result files."""
+    """The run has no result files: it did not come to its end."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -738,7 +738,7 @@ def _content(row: Row[Any]) -> Content:
 
 def _key(source: str) -> str:
     """Return the lookup key of a source: itself, or the text "sha256" and its digest if it is longer than 600
-    characters, as in the databases of earlier versions."""
+    characters."""
     return source if len(source) <= _LONGEST_KEY else f"sha256 {sha256(source.encode()).hexdigest()}"
 
 

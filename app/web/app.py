@@ -6,7 +6,6 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI, Request
@@ -17,12 +16,12 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.common.settings import Settings
-from app.common.timers import TooManyRequestsError
+from app.common.timers import TooManyRequestsError, ended
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.learning import Learning
 from app.dashboard.parameters import ParameterState
 from app.dashboard.selection import NoStoryError, NothingMappedError
+from app.extension import extensions_on
 from app.store.async_store import AsyncStore, StoreBusyError
 from app.store.forests import Forests
 from app.store.records import UnknownError
@@ -48,19 +47,6 @@ MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], "Scene"]
 MakeWorker = Callable[[], WorkerProcess]
 
 
-@dataclass(frozen=True, slots=True)
-class FleetLink:
-    """The fleet that a dashboard belongs to.
-
-    Attributes:
-        port: Port of the page of all robots.
-        open_records: Returns the numbers of the runs that are open in any dashboard of the fleet.
-    """
-
-    port: int
-    open_records: Callable[[], set[int | None]]
-
-
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 
 _HEADERS = (
@@ -82,7 +68,7 @@ def build(
     parameter_state: ParameterState,
     make_scene: MakeScene | None = None,
     make_worker: MakeWorker = WorkerProcess,
-    fleet: FleetLink | None = None,
+    open_records: Callable[[], set[int | None]] | None = None,
 ) -> FastAPI:
     """Return the application of one dashboard. Worker, scene and source are started when the application
     starts, and ended with it; abandoned uploads are removed then.
@@ -95,14 +81,11 @@ def build(
         parameter_state: Parameters at the start; its `check` is set.
         make_scene: Replaces viser in tests.
         make_worker: Returns the worker, which may run already; tests replace it.
-        fleet: The fleet that the dashboard belongs to, if any.
+        open_records: Returns the numbers of the records that are open; None for that of this dashboard.
     """
     parameter_state.check = Forests(settings.folder).check
     dashboard = Dashboard(parameter_state, Broadcast(), AsyncStore(settings.folder))
 
-    learning = Learning(
-        dashboard.store, settings.folder, lambda state: dashboard.live.publish("learning", state)
-    )
     kept_uploads = uploads.Uploads(settings.uploads, settings.upload_limit, dashboard.store)
 
     @asynccontextmanager
@@ -114,16 +97,22 @@ def build(
         try:
             yield
         finally:
-            await learning.close()
+            await ended(app.state.closing)
             await dashboard.close()
 
     app = guarded(settings, port=port, tokens=tokens, lifespan=lifespan)
     app.state.dashboard, app.state.settings = dashboard, settings
-    app.state.fleet_port = None if fleet is None else fleet.port
-    app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.run_recorder.record}
-    app.state.uploads, app.state.learning, app.state.limits = kept_uploads, learning, Limits()
+    app.state.open_records = open_records or (lambda: {dashboard.run_recorder.record})
+    app.state.uploads, app.state.limits = kept_uploads, Limits()
+    app.state.closing = []  # what extensions end before the dashboard
     for router in ROUTERS:
         app.include_router(router)
+    for name, extension in extensions_on().items():
+        if extension.web is not None:
+            try:
+                extension.web(app)
+            except Exception:  # the dashboard works without it
+                _log.exception("the extension %s is left out of the dashboard", name)
     return app
 
 

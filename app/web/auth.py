@@ -97,8 +97,8 @@ def viewer_token(token: str, salt: bytes = b"") -> str:
 
 
 class AccessTokens:
-    """The tokens of the owner's link and of the view-only link, and the open websockets of viewers. The
-    dashboards of a fleet share them.
+    """The tokens of the owner's link and of the view-only link, and the open websockets of viewers.
+    Several dashboards may share them.
 
     Args:
         owner: Token of the owner's link.

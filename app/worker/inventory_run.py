@@ -368,7 +368,8 @@ def _clusters_of(plot: PlotMap, middle: Float, base_z: float, labels: Int32) -> 
     foot = plot.ground.at(plot.place[:, 0], plot.place[:, 1]) - base_z
     # A candidate without a circle is shown as a thin box at breast height.
     low = np.nan_to_num(stems["first"], nan=BREAST - 1.0)
-    width = 2.0 * np.nan_to_num(stems["radius"], nan=0.1)
+    radius = np.maximum(stems["radius"], 0.0)  # a line through circles of another height may end before
+    width = 2.0 * np.nan_to_num(radius, nan=0.1)
     height = np.nan_to_num(stems["last"] - stems["first"], nan=1.0)
     size = np.maximum(np.bincount(labels[labels >= 0], minlength=n), np.nan_to_num(stems["points"]))
     return Clusters(
@@ -377,7 +378,7 @@ def _clusters_of(plot: PlotMap, middle: Float, base_z: float, labels: Int32) -> 
         eccentricity=nan,
         centre=plot.place - middle,
         covariance=np.tile(np.eye(2) * np.nan, (n, 1, 1)),
-        radius=stems["radius"].copy(),
+        radius=radius,
         radius_sigma=nan,
         radial_std=stems["scatter"].copy(),
         arc=stems["coverage"].copy(),

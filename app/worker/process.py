@@ -23,7 +23,7 @@ from app.worker.outbox import Outbox, RecentScans
 from app.worker.protocol import ToWorker, WireError, to_worker
 from app.worker.session import Session
 from pipeline.config import Parameters
-from pipeline.io.readers import is_cloud, path_of
+from pipeline.io.readers import path_of
 from pipeline.io.readers.base import Source, SourceOptions
 from pipeline.jit import on_compiling
 
@@ -48,17 +48,17 @@ def new_session() -> Session:
 
 
 def open_any_or_cloud(uri: str, options: SourceOptions) -> Source | LiveSource:
-    """Open a source by its URI: a file with a whole cloud to be mapped as a whole, for which the options are
-    ignored; else as `open_any`. A drive through a cloud has the URI sim:cloud?file=PATH.
+    """Open a source by its URI: a file with a whole cloud to be mapped as a whole; else as `open_any`. A
+    drive through a cloud has the URI sim:cloud?file=PATH.
 
     Raises:
         SourceError: The source does not exist, has an unknown format, or is damaged.
     """
     from app.robot.source import open_any
-    from app.sources.opening import open_cloud
+    from app.sources.opening import is_cloud, open_cloud
 
     path = path_of(uri)
-    return CloudSource(open_cloud(path)) if is_cloud(path) else open_any(uri, options)
+    return CloudSource(open_cloud(path, options)) if is_cloud(path, options) else open_any(uri, options)
 
 
 def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:

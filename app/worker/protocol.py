@@ -35,15 +35,21 @@ class CloudFrame:
 
     Attributes:
         offset: Offset x, y, z of the frame of the map in the coordinates of the file [m].
-        crs: Coordinate reference system of the file; "" if unknown.
+        crs: Coordinate reference system of the file, in metres; "" if unknown.
         points: Number of points of the file.
         parameters: Dotted names of the parameters that change the map.
+        crs_unit: Metres per unit of the reference system in which positions are written, horizontal and
+            vertical.
+        unit, up: Unit of the coordinates of the file and its axis that points up, for people.
     """
 
     offset: tuple[float, float, float]
     crs: str
     points: int
     parameters: list[str]
+    crs_unit: tuple[float, float] = (1.0, 1.0)
+    unit: str = "metres"
+    up: str = "z"
 
 
 @dataclass(frozen=True, slots=True)

@@ -558,7 +558,15 @@ def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | Non
 def _with_cloud(status: Status, run: InventoryRun) -> Status:
     """Return the status of a whole cloud: its frame, and the progress of its first map."""
     about = run.about
-    cloud = CloudFrame(tuple(about.offset.tolist()), about.crs, about.points, list(PARAMETERS))
+    cloud = CloudFrame(
+        tuple(about.offset.tolist()),
+        about.crs,
+        about.points,
+        list(PARAMETERS),
+        about.crs_unit,
+        about.unit,
+        about.up,
+    )
     if run.frame is None and run.share is not None and status.state in ("playing", "paused"):
         detail = f"Mapping the cloud: {100.0 * run.share:.0f} %"
         return replace(status, cloud=cloud, state="starting", detail=detail)

@@ -140,7 +140,7 @@ def _damaged(path: Path, why: str) -> StemmapError:
     return StemmapError(
         f"the decision trees cannot be read: {why}",
         where=str(path),
-        remedy="Restore the file of the package, or `stemmap train` trains another one",
+        remedy="Restore the file of the package: install stemmap again",
     )
 
 

@@ -73,6 +73,7 @@ def update_visibility(
     viewed: Float,
     present: Float,
     absent: Float,
+    absent_lately: Float,
     pose: Float,
     clear_range: Float,
     steepest: Float,
@@ -84,12 +85,13 @@ def update_visibility(
     place.
 
     A column is present if the free range ends within NEAR of it, absent if it ends more than BEHIND beyond
-    it. Otherwise, as when something nearer hides it, neither is counted. The observed height counts in each
+    it. Otherwise, as when something nearer hides it, neither is counted. `absent_lately` counts the last
+    scans that show it absent, and is 0 after one that shows it present. The observed height counts in each
     case.
 
     Args:
         axis: Axes of the columns, shape (K, 5).
-        viewed, present, absent: Statistics of the columns, shape (K,), changed in place.
+        viewed, present, absent, absent_lately: Statistics of the columns, shape (K,), changed in place.
         pose: Pose x, y [m], yaw [rad] of the base in the map, shape (3,).
         clear_range, steepest: Free range [m] and tangent of the steepest elevation by direction in the base
             frame, shape (BINS,); see `ScanView`.
@@ -110,8 +112,10 @@ def update_visibility(
         viewed[k] = max(viewed[k], min(up, SLICES * SLICE))
         if clear_range[b] > reach + BEHIND:
             absent[k] += 1.0
+            absent_lately[k] += 1.0
         elif abs(clear_range[b] - reach) < NEAR:
             present[k] += 1.0
+            absent_lately[k] = 0.0
 
 
 @compiled

@@ -6,25 +6,22 @@ The sliders, the REST schema, `--set stage.name=value`, the TOML file and docs/p
 from pipeline.config.model import (
     FieldSpec,
     Parameters,
-    RenamedParameterWarning,
     assign,
-    current_names,
     field_specs,
     from_toml,
     markdown_table,
     to_toml,
 )
-from pipeline.config.presets import PRESETS, preset
+from pipeline.config.presets import OF_ONE_SENSOR, PRESETS, preset
 from pipeline.config.stages import Stage
 
 __all__ = [
+    "OF_ONE_SENSOR",
     "PRESETS",
     "FieldSpec",
     "Parameters",
-    "RenamedParameterWarning",
     "Stage",
     "assign",
-    "current_names",
     "field_specs",
     "from_toml",
     "markdown_table",

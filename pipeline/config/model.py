@@ -6,7 +6,6 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -18,30 +17,6 @@ from pipeline.config.stages import Stage
 from pipeline.errors import ParameterError
 
 Value = float | int | bool | str
-
-# Names of earlier versions, which files, saved sets and the command line may still use.
-RENAMED_STAGES = {"gathering": "classification"}
-RENAMED = {
-    "shape.slices": "shape.split_slices",
-}
-# Choices of earlier versions and their replacement: a graph of keyframes now always corrects FastSLAM.
-RENAMED_CHOICES = {("slam.method", "graph"): "fastslam2"}
-# Parameters of earlier versions that no longer exist; their values are ignored.
-REMOVED = frozenset(
-    {
-        "classification.every",
-        "shape.plane",
-        "slam.independent_views_max",
-        "slam.looks",
-        "tracking.gate",
-        "tracking.distance_max",
-        "tracking.misses_per_hit",
-    }
-)
-
-
-class RenamedParameterWarning(FutureWarning):
-    """A parameter is given under the name of an earlier version."""
 
 
 class Parameters(BaseModel):
@@ -66,15 +41,12 @@ class Parameters(BaseModel):
         """Return a copy in which the values with the dotted names in `changes` are replaced, validated as a
         whole.
 
-        Names and choices of earlier versions are accepted with a RenamedParameterWarning; removed parameters
-        are ignored with such a warning.
-
         Raises:
             ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
                 contradict each other.
         """
         tree = self.model_dump()
-        for name, value in current_names(changes).items():
+        for name, value in changes.items():
             stage, _, field_name = name.partition(".")
             if stage not in tree or field_name not in tree[stage]:
                 raise ParameterError(
@@ -100,69 +72,18 @@ class Parameters(BaseModel):
         return {name: value for name, value in self.flat().items() if others[name] != value}
 
 
-def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a dict from dotted names to values, with names and choices of earlier versions replaced by the
-    current ones. Removed parameters are left out; unknown names are kept.
-
-    A RenamedParameterWarning is issued for each renamed parameter, each removed parameter and each replaced
-    choice. A value under the current name takes precedence over one under an earlier name.
-    """
-    result: dict[str, Any] = {}
-    for name, given in values.items():
-        current, value = _current_name(name), given
-        if isinstance(given, str) and (name, given) in RENAMED_CHOICES:
-            value = RENAMED_CHOICES[name, given]
-            _warn(f"{name} = {given} no longer exists; {value} is used")
-        if current is None:
-            _warn(f"the parameter {name} no longer exists and is ignored")
-        elif current == name:
-            result[name] = value
-        else:
-            _warn(f"the parameter {name} is now called {current}")
-            if current not in values:
-                result[current] = value
-    return result
-
-
-def _current_name(name: str) -> str | None:
-    """Return the current dotted name of a parameter, an unknown name as it is, or None if the parameter was
-    removed."""
-    stage, dot, field_name = RENAMED.get(name, name).partition(".")
-    name = f"{RENAMED_STAGES.get(stage, stage)}{dot}{field_name}"
-    return None if name in REMOVED else name
-
-
-def _warn(message: str) -> None:
-    """Issue a RenamedParameterWarning with a message."""
-    warnings.warn(message, RenamedParameterWarning, stacklevel=2)
-
-
 def validated(tree: Mapping[str, Any]) -> Parameters:
     """Return parameters from nested mappings (stage, parameter). Stages and parameters that are missing have
-    their defaults, those of the preset `forest`. Names and choices of earlier versions are accepted with a
-    RenamedParameterWarning; removed parameters are ignored with such a warning.
+    their defaults, those of the preset `forest`.
 
     Raises:
         ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
             contradict each other. The message describes the first error in one line.
     """
     try:
-        return Parameters.model_validate(_current_tree(tree))
+        return Parameters.model_validate(tree)
     except ValidationError as error:
         raise ParameterError(_first_message(error)) from None
-
-
-def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a dict from stages to dicts from parameters to values with the names of earlier versions
-    replaced by the current names and without removed parameters, each with a RenamedParameterWarning; a stage
-    whose value is not a mapping is returned as it is, to be refused by the validation."""
-    nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
-    result = {stage: values for stage, values in tree.items() if stage not in nested}
-    flat = {f"{stage}.{name}": value for stage, values in nested.items() for name, value in values.items()}
-    for dotted, value in current_names(flat).items():
-        stage, _, name = dotted.partition(".")
-        result.setdefault(stage, {})[name] = value
-    return result
 
 
 def _first_message(error: ValidationError) -> str:
@@ -293,8 +214,7 @@ _DEEP_NAME = re.compile(r"(?:\.[^.,=\n]{0,100}){20}")
 
 def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
     """Return parameters changed by `stage.name=value` texts of the command line. Spaces around name and value
-    are ignored; of two texts with one name the later one counts. Names of earlier versions give a
-    RenamedParameterWarning, and removed parameters are ignored with such a warning, see `current_names`.
+    are ignored; of two texts with one name the later one counts.
 
     Raises:
         ParameterError: A text has no "=", a name is unknown, or a value is not valid.
@@ -307,10 +227,7 @@ def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
             raise ParameterError(f"{text!r} is not stage.name=value", remedy="E.g. --set clustering.eps=0.3")
         changes[name] = value
     return parameters.replace(
-        {
-            name: parsed(specs[name], value) if name in specs else value
-            for name, value in current_names(changes).items()
-        }
+        {name: parsed(specs[name], value) if name in specs else value for name, value in changes.items()}
     )
 
 
@@ -351,9 +268,7 @@ def to_toml(parameters: Parameters) -> str:
 
 
 def from_toml(text: str, base: Parameters, where: str) -> Parameters:
-    """Return the base set with the values of a TOML text; the text may omit stages and values. Names of
-    earlier versions give a RenamedParameterWarning, and removed parameters are ignored with such a warning,
-    see `current_names`.
+    """Return the base set with the values of a TOML text; the text may omit stages and values.
 
     Args:
         text: Content of the file.
@@ -370,12 +285,10 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
             raise ParameterError(
                 f"{stage} is not inside a stage", where=where, remedy="Write it below a line [stage]"
             )
-    values = current_names({f"{stage}.{name}": v for stage, vs in given.items() for name, v in vs.items()})
     tree: dict[str, Any] = base.model_dump()
-    for dotted, value in values.items():
-        stage, _, name = dotted.partition(".")
+    for stage, values in given.items():
         # TOML distinguishes 1 from 1.0; both are valid for a floating-point parameter.
-        tree.setdefault(stage, {})[name] = value
+        tree.setdefault(stage, {}).update(values)
     try:
         return validated(tree)
     except ParameterError as error:

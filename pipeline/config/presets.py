@@ -120,8 +120,11 @@ PRESETS: dict[str, tuple[str, dict[str, object]]] = {
         {**_PAPER, "detection.e_min": 10.0},
     ),
     "stems": ("Stems detected by another program, as in a folder of TreeManagerState files", _STEMS),
-    "laser2d": ("A planar laser, as on the car of Victoria Park", _LASER2D),
+    "laser2d": ("A planar laser, as on a car", _LASER2D),
 }
+
+#: Presets for one other kind of sensor each; the remaining presets are for scans of a 3D LiDAR.
+OF_ONE_SENSOR = frozenset({"stems", "laser2d"})
 
 
 @cache

@@ -185,7 +185,8 @@ class Clustering(Stage):
     """2 clusters the horizontal projection, 3 the 3D points."""
 
     eps: float = number(0.15, "Radius eps", "m", 0.01, 5.0, 0.01, (0.05, 1.0), main=True)
-    """Maximum distance between neighbouring points (DBSCAN eps)."""
+    """Maximum distance between neighbouring points (DBSCAN eps); a sensor with returns a degree apart uses at
+    least 0.2 m."""
 
     min_points: int = count(8, "Minimum points", "", 1, 500, main=True)
     """Neighbours, including the point itself, that make a point a core point (DBSCAN min_samples)."""
@@ -233,6 +234,10 @@ class Detection(Stage):
 
     radius_max: float = number(0.6, "Maximum radius", "m", 0.01, 5.0, 0.01)
     """Thicker stems are rejected."""
+
+    cloud_radius_max: float = number(1.25, "Maximum radius in a cloud", "m", 0.01, 5.0, 0.01)
+    """Thicker stems of a whole cloud are rejected. The limit exceeds that of a scan because a whole cloud
+    shows stems from several sides, and few trees have a diameter above 2.5 m."""
 
     height_extent_min: float = number(0.5, "Minimum visible height", "m", 0.0, 10.0, 0.05)
     """Clusters of a smaller height extent are rejected."""

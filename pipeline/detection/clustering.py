@@ -515,12 +515,17 @@ ENGINES: dict[str, Engine] = {
 }
 
 
+#: A coarse sensor (Mid-360: one degree between returns) must not cut a stem in two at this range: `eps` is at
+#: least the distance of its returns there, up to EPS_MOST, above which undergrowth joins the stems [m].
+COARSE_RANGE, EPS_MOST = 12.0, 0.25
+
+
 def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
     """Cluster the points of a scan.
 
     Args:
         points: Points in the level sensor frame, float32, shape (N, 3) [m], finite; may be empty.
-        sensor: The LiDAR, whose angular resolution sets weights and beam gaps.
+        sensor: The LiDAR, whose angular resolution sets weights, beam gaps and the least `eps`.
         parameters: Method and thresholds. The method "range_jump" uses `eps` as the maximum jump; otherwise
             `engine` runs DBSCAN on the first two or three coordinates, with weights if `stem_area` is above
             0.
@@ -535,8 +540,9 @@ def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
     if parameters.method == "range_jump":
         label, hidden = range_jump(points, parameters.eps, parameters.min_points, sensor.azimuth_step)
         return Labels(label, len(hidden), hidden)
+    eps = max(parameters.eps, min(sensor.azimuth_step * COARSE_RANGE, EPS_MOST))
     plane = np.ascontiguousarray(points[:, : parameters.dimensions])
     weight = weigh(points, sensor, parameters) if parameters.stem_area > 0.0 else None
-    label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points, weight)
+    label = ENGINES[parameters.engine](plane, eps, parameters.min_points, weight)
     clusters = int(label.max(initial=-1)) + 1
     return Labels(label, clusters, np.zeros(clusters, np.bool_))

@@ -33,6 +33,9 @@ RAY = 4
 TUKEY = 3.0  # sigma; residuals beyond have no weight
 BARK = 0.01  # m; roughness of the bark
 BEAM = 0.0015  # rad; half the beam divergence
+#: Of the radius that the returns cover: the lines of a coarse sensor climb, and cross a thin stem from edge
+#: to edge, so that hardly anything beside them is not hit.
+COARSE_MOST = 0.5
 PRIOR_LEAN_SIGMA = 0.08  # 4.6 degrees; stems beyond twice that are windthrow
 
 
@@ -404,7 +407,7 @@ def _fit(
     away = np.hypot(half.x, half.y)
     # Between the outermost beam and the next one, a part of the trunk is not hit, less the width of the
     # beams.
-    coarse = 0.5 * max(azimuth_step - 2.0 * BEAM, 0.0) * away
+    coarse = min(0.5 * max(azimuth_step - 2.0 * BEAM, 0.0) * away, COARSE_MOST * half.radius)
     width = half.radius + coarse
     p = np.array([half.x, half.y, 0.0, 0.0, max(width, RADIUS_MIN)])
     p[0] += half.c * p[4]

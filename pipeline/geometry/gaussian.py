@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 
 SMALL_TURN = 0.02  # rad; below it the series of sine and cosine is exact to 1e-10
 
@@ -62,7 +62,7 @@ def rows_of(covariance: Float) -> Float:
     return rows
 
 
-@compiled_within
+@compiled_borrowing
 def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
     """Return xx, xy, yy of C R[d] C^T, where C is the rotation by the angle with cosine c and sine s; R holds
     the elements xx, xy, yy of covariances, shape (D, 3)."""
@@ -74,7 +74,7 @@ def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
     )
 
 
-@compiled_within
+@compiled_borrowing
 def expected_spread(
     pose: Pose, c: float, s: float, ax: float, ay: float, R: Float, d: int
 ) -> tuple[float, float, float]:
@@ -166,7 +166,7 @@ def by_pose(x: float, y: float, Sigma: Float) -> tuple[float, float, float]:
     )
 
 
-@compiled_within
+@compiled_borrowing
 def corrected(
     pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float
 ) -> Pose:
@@ -198,7 +198,7 @@ def corrected(
     )
 
 
-@compiled_within
+@compiled_borrowing
 def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
     """Return cosine and sine of a yaw after a rotation.
 
@@ -214,7 +214,7 @@ def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
     return c * cos - s * sin, s * cos + c * sin
 
 
-@compiled_within
+@compiled_borrowing
 def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
     """Sample row p of `out` from the Gaussian N(mu, P): mu + L noise[p] with L L^T = P (Cholesky), yaw
     wrapped.

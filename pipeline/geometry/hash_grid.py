@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 
 Bool = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
@@ -52,14 +52,14 @@ def per_metre(radius: float) -> float:
     return 0.5 / (WIDER * radius)
 
 
-@compiled_within
+@compiled_borrowing
 def cell_of(u: int, v: int) -> int:
     """Return the index of a cell in `Cells.head` by its row u and its column v in the plane, which may be
     negative."""
     return (u & (SIDE - 1)) * SIDE + (v & (SIDE - 1))
 
 
-@compiled_within
+@compiled_borrowing
 def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
     """Return row and column (see `cell_of`) of the first of the two by two cells that contain all positions
     within the radius of x, y [m]; the others have a row, a column or both larger by 1. `scale` are the cells
@@ -67,7 +67,7 @@ def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
     return int(np.floor(scale * x - 0.5)), int(np.floor(scale * y - 0.5))
 
 
-@compiled_within
+@compiled_borrowing
 def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
     """Put positions into empty cells, in place, the lowest row first in each chain.
 
@@ -81,7 +81,7 @@ def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
         put_in(cells, mean, j, scale)
 
 
-@compiled_within
+@compiled_borrowing
 def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
     """Put row j of `mean`, finite positions with x, y first, shape (L, 2 or more) [m], which is in no cell,
     into its cell, in place, at the start of the chain; `scale` are the cells per metre."""
@@ -91,7 +91,7 @@ def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
     cells.head[at] = j
 
 
-@compiled_within
+@compiled_borrowing
 def take_out(cells: Cells, j: int) -> None:
     """Remove row j, which `put_in` added and which was not removed since, from its cell, in place."""
     before = cells.head[cells.cell[j]]
@@ -103,14 +103,14 @@ def take_out(cells: Cells, j: int) -> None:
     cells.following[before] = cells.following[j]
 
 
-@compiled_within
+@compiled_borrowing
 def clear(cells: Cells, known: int) -> None:
     """Empty the cells of rows 0 to known - 1, in place; a cell is emptied with all rows of its chain."""
     for j in range(known):
         cells.head[cells.cell[j]] = -1
 
 
-@compiled_within
+@compiled_borrowing
 def holds_unseen(
     cells: Cells, mean: Float, seen: Bool, x: float, y: float, radius2: float, scale: float
 ) -> bool:
@@ -134,7 +134,7 @@ def holds_unseen(
     return False
 
 
-@compiled_within
+@compiled_borrowing
 def nearest_in(cells: Cells, mean: Float, x: float, y: float, reach: float, scale: float) -> int:
     """Return the row of the position nearest to x, y [m], the lowest of equally near ones; -1 for none within
     a reach.

@@ -24,24 +24,43 @@ from pipeline.inventory.cross_sections import (
     FIGURES,
     HIGHEST,
     LOWEST,
+    Sampling,
     Slices,
     cut,
     find_columns,
+    measure_sampling,
     slice_heights,
     strongest_first,
     trace,
     upper_end,
 )
 from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of, without_heights
-from pipeline.inventory.stem_model import Stems, classify_stems, describe_stems, diameters, is_repeated
+from pipeline.inventory.stem_model import (
+    Stems,
+    are_stumps,
+    classify_stems,
+    describe_stems,
+    diameters,
+    ends_are_seen,
+    is_repeated,
+)
 from pipeline.inventory.terrain_raster import LowestReturns, TerrainRaster, heights_above
-from pipeline.types.records import Float32, Int, Int32, Trees, Verdict, WholeCloud
+from pipeline.io.readers.cloud_frame import UNNAMED
+from pipeline.types.records import CloudDescription, Float32, Int, Int32, Trees, Verdict, WholeCloud
 
 MOST_RASTER = 96 << 20  # bytes
 COARSE = 0.04  # m; coarser thinning makes diameters less precise
 NEVER = -1  # an unknown time
 TRACED = 8  # columns between two reports of progress
 LEAST_RADIUS = 0.02  # m; smaller circles are twigs
+THINNER = 0.01  # m; by which the radius of a stem is smaller a metre or two above breast height
+#: First words of the warning about a cloud narrower than NARROW [m] and more than LONG_SIDE times as long.
+SECTION = "the cloud is a section through a plot"
+NARROW, LONG_SIDE = 0.5, 4.0  # stems are as thick, and the cloud of a single one is as wide as long
+#: The highest tree that is known [m] (a coast redwood, 2019), and the distance from equator to pole [m],
+#: which no northing in metres exceeds.
+HIGHEST_TREE, LARGEST_NORTHING = 116.0, 1e7
+GIANT_HEIGHT, GIANT_DBH = 60.0, 0.8  # m; a pine of 20 m and 0.25 m has both if its feet are taken as metres
 SHOWN, SHOWN_SIDE = 1 << 17, 0.02  # points of all heights that are kept, and smallest side of their cubes [m]
 
 T = TypeVar("T")
@@ -96,7 +115,8 @@ class PlotPoints:
         ground: Height map.
         near: Points between LOWEST and HIGHEST above the ground, x, y, z, height [m].
         slices: The points of `near` by height.
-        axes, features: Axes and features of the columns, see `find_columns`, strongest first.
+        axes, features, unseen: Axes and both tables of features of the columns, see `find_columns`, strongest
+            first.
         voxels: Points of all heights.
         counts: Dict from names to numbers of points, as in `PlotMap`.
     """
@@ -106,6 +126,7 @@ class PlotPoints:
     slices: Slices
     axes: Float
     features: Float
+    unseen: Float
     voxels: Voxels
     counts: dict[str, int]
 
@@ -113,7 +134,7 @@ class PlotPoints:
 #: Parameters that change the map of a cloud.
 PARAMETERS = (
     "detection.radius_min",
-    "detection.radius_max",
+    "detection.cloud_radius_max",
     "tracking.dbh_arc_min",
     "ground.slope_max",
     "classification.forest",
@@ -166,21 +187,27 @@ class Inventory:
             StemmapError: There is no such forest.
             OSError: The temporary file of the points cannot be read.
         """
-        r_min, r_max = max(parameters.detection.radius_min, LEAST_RADIUS), parameters.detection.radius_max
+        r_max = parameters.detection.cloud_radius_max
+        r_min = max(parameters.detection.radius_min - THINNER, LEAST_RADIUS)
         slope = parameters.ground.slope_max
         if self._kept is None or self._kept[0] != slope:
             self._kept = (slope, (yield from self._points(slope)))
         p = self._kept[1]
-        share = vote(p.features, self._forests(parameters.classification.forest, True))
         parts = [np.zeros((0, len(slice_heights()), FIGURES))]
-        described = [describe_stems(parts[0])]
+        sampling = measure_sampling(p.slices, p.axes, r_min, r_max)
         for k in range(0, len(p.axes), TRACED):
             yield 0.5 + 0.4 * k / len(p.axes)
-            parts.append(trace(p.slices, p.axes[k : k + TRACED], r_min, r_max))
-            described.append(describe_stems(parts[-1]))
-        circles, stems = np.concatenate(parts), np.concatenate(described)
+            parts.append(trace(p.slices, p.axes[k : k + TRACED], r_min, r_max, sampling))
+        circles = np.concatenate(parts)
+        stems = describe_stems(circles)
         yield 0.9
-        verdict = classify_stems(stems, share, parameters.detection.radius_min, r_max)
+        seen = ends_are_seen(stems, p.features, parameters.detection.radius_min, r_max)
+        rows = np.where(seen[:, None], p.features, p.unseen)
+        share = vote(rows, self._forests(parameters.classification.forest, True))
+        radii = parameters.detection.radius_min, r_max
+        verdict = classify_stems(stems, share, *radii)
+        verdict[are_stumps(stems, rows, share, *radii)] = Verdict.STUMP
+        yield from _find_thick(p, sampling, circles, stems, share, verdict, r_max)
         kept = np.flatnonzero(~is_repeated(stems, p.axes, verdict))
         circles, stems, share, verdict = circles[kept], stems[kept], share[kept], verdict[kept]
         place = np.column_stack([stems["x"], stems["y"]])
@@ -190,8 +217,10 @@ class Inventory:
         crowns = find_crowns(p.voxels, stems[order], p.ground)
         if self._cloud.description.cut_above:
             crowns = without_heights(crowns, "the sensor of the drive did not see above its field of view")
+        trees = _trees(stems[order], np.radians(parameters.tracking.dbh_arc_min), crowns)
+        doubt = _unit_doubt(self._cloud.description, trees.dbh, p.voxels.points[:, 3])
         return PlotMap(
-            trees=_trees(stems[order], np.radians(parameters.tracking.dbh_arc_min), crowns),
+            trees=trees,
             stems=stems,
             place=place,
             circles=circles,
@@ -204,7 +233,7 @@ class Inventory:
             crowns=crowns,
             counts=p.counts,
             voxel_size=p.near.side,
-            warnings=_warnings(self._cloud, p),
+            warnings=(*_warnings(self._cloud, p), *_too_thick(verdict, r_max), *doubt),
         )
 
     def close(self) -> None:
@@ -286,7 +315,8 @@ def ground_steps(
         raise SourceError(
             f"the cloud is too large for one plot: {wide:.0f} x {long:.0f} m",
             where=cloud.description.uri,
-            remedy="Cut it into plots of at most 400 x 400 m",
+            remedy="Cut it into plots of at most 400 x 400 m; if its coordinates are no metres, name their "
+            "unit with --unit",
         )
     lowest = LowestReturns(extent.low, extent.high)
     for part in cloud.parts():
@@ -341,14 +371,94 @@ def _trees(stems: Stems, arc_min: float, crowns: Crowns) -> Trees:
     )
 
 
+def _find_thick(
+    points: PlotPoints,
+    sampling: Sampling,
+    circles: Float,
+    stems: Stems,
+    share: Float,
+    verdict: Int32,
+    r_max: float,
+) -> Generator[float, None, None]:
+    """Search the columns without a stem for one up to twice as thick as the limit, and enter it as TOO_THICK,
+    in place; yield the share of the work that is done.
+
+    Args:
+        points: Points of the plot.
+        sampling: Noise and density of the points.
+        circles, stems, share, verdict: Results for all columns.
+        r_max: Maximum radius of a tree [m].
+    """
+    rest = np.flatnonzero(np.isnan(stems["radius"]))
+    for k in range(0, len(rest), TRACED):
+        yield 0.9
+        rows = rest[k : k + TRACED]
+        wide = trace(points.slices, points.axes[rows], r_max, 2.0 * r_max, sampling)
+        found = describe_stems(wide)
+        thick = classify_stems(found, share[rows], 0.0, 2.0 * r_max) == Verdict.TREE
+        thick &= (found["radius"] > r_max) & (found["coverage"] > np.pi)  # a wall shows less of a circle
+        circles[rows[thick]], stems[rows[thick]] = wide[thick], found[thick]
+        verdict[rows[thick]] = Verdict.TOO_THICK
+
+
+def _too_thick(verdict: Int32, r_max: float) -> list[str]:
+    """Return a warning that names the limit if stems are too thick for it."""
+    n = int(np.count_nonzero(verdict == Verdict.TOO_THICK))
+    words = "1 stem is" if n == 1 else f"{n} stems are"
+    return [
+        f"{words} thicker than the limit of {2.0 * r_max:g} m and not in the map; the parameter of the limit "
+        "is detection.cloud_radius_max (a radius)"
+    ] * (n > 0)
+
+
+def _unit_doubt(about: CloudDescription, dbh: Float, above: Float32) -> list[str]:
+    """Return a warning if the numbers of a cloud whose file names no unit are hardly metres.
+
+    Args:
+        about: Description of the cloud.
+        dbh: Diameters of the trees [m], NaN where unknown.
+        above: Heights of its points above the ground [m].
+    """
+    if about.unit != UNNAMED or not len(above):
+        return []
+    high, known = float(np.percentile(above, 99.9)), dbh[np.isfinite(dbh)]
+    wide = float(np.median(known)) if len(known) else 0.0
+    if about.offset[1] > LARGEST_NORTHING:
+        reason = f"northings of {about.offset[1]:,.0f} m, and on Earth there are none above 10,000,000 m"
+    elif high > HIGHEST_TREE:
+        reason = f"a height of {high:.0f} m above the ground, and no tree is higher than {HIGHEST_TREE:.0f} m"
+    elif high > GIANT_HEIGHT and wide > GIANT_DBH:
+        reason = f"a height of {high:.0f} m and a median DBH of {wide:.1f} m, which only giant trees have"
+    else:
+        return []
+    return [f"the coordinates may be feet: as metres they give {reason}; name the unit with --unit ft"]
+
+
+def _sides(place: Float) -> tuple[float, float]:
+    """Return the shorter and the longer side of the smallest rectangle, in any direction, around points of
+    shape (N, 2) [m]; zeros without points."""
+    import shapely
+
+    corners = shapely.get_coordinates(shapely.oriented_envelope(shapely.multipoints(place)))
+    sides = np.hypot(*np.diff(corners, axis=0).T)[:2].tolist()  # fewer for points on a line
+    narrow, long = sorted([0.0, 0.0, *sides])[-2:]
+    return narrow, long
+
+
 def _warnings(cloud: WholeCloud, points: PlotPoints) -> tuple[str, ...]:
-    """Return the warnings of the cloud and those about coarse thinning, missing points above the ground and
-    little visible ground."""
+    """Return the warnings of the cloud and those about coarse thinning, a narrow cloud, missing points above
+    the ground and little visible ground."""
     warnings = list(cloud.description.warnings)
     if points.near.side > COARSE:
         warnings.append(
             f"the cloud was thinned to {100.0 * points.near.side:.0f} cm, which makes diameters less sharp: "
             "cut it into smaller plots"
+        )
+    narrow, long = _sides(points.voxels.points[:, :2].astype(np.float64))
+    if narrow < NARROW and long > LONG_SIDE * narrow:
+        warnings.append(
+            f"{SECTION}, only {narrow:.2f} m wide and {long:.1f} m long: its sides cut the stems, which "
+            "are missing or have no diameter"
         )
     if len(points.slices.xy) == 0:
         warnings.append("there are no points higher than 0.2 m above the lowest returns")

@@ -65,13 +65,15 @@ def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Fl
         if not r_min <= r <= r_max or np.sqrt(x * x + y * y) > r + tolerance:
             continue
         near = min(tolerance, r / 3.0)
-        votes = 0.0
+        inside, outside = (r - near) ** 2, (r + near) ** 2
+        votes, left = 0.0, float((n - 1) // stride + 1)
         for i in range(0, n, stride):
-            off = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) - r
-            if abs(off) < near:
-                votes += 1.0 - abs(off) / near
-            elif off < 0.0:
-                votes -= 1.0
+            left -= 1.0
+            d2 = (xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2
+            if d2 < outside:
+                votes += 1.0 - abs(np.sqrt(d2) - r) / near if d2 > inside else -1.0
+            if votes + left <= best:  # also if all others are on the circle
+                break
         if votes > best:
             best = votes
             out[0], out[1], out[2] = x, y, r
@@ -170,27 +172,32 @@ def without_scatter(radius: Float, scatter: Float) -> Float:
 
 @compiled
 def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tuple[float, float]:
-    """Return the angle of a circle that points on it cover [rad], in steps of 2 pi / SECTORS, and the number
-    of these points.
+    """Return the angle of a circle that points on it cover [rad], and the number of these points. The angle
+    is counted in SECTORS equal steps, or in 1.5 for each point if these are fewer: finer steps are empty by
+    chance.
 
     Args:
         xy: Points, shape (N, 2) [m].
         x, y, r: Centre and radius of the circle [m].
         tolerance: Maximum distance of a point on the circle [m].
     """
-    filled = np.zeros(SECTORS, np.bool_)
-    on = 0.0
+    turn = np.empty(xy.shape[0])
+    on = 0
     for i in range(xy.shape[0]):
         dx, dy = xy[i, 0] - x, xy[i, 1] - y
         if abs(np.sqrt(dx * dx + dy * dy) - r) < tolerance:
-            on += 1.0
-            filled[int((np.arctan2(dy, dx) / (2.0 * np.pi) + 0.5) * SECTORS) % SECTORS] = True
+            turn[on] = np.arctan2(dy, dx) / (2.0 * np.pi) + 0.5
+            on += 1
+    sectors = max(min(int(1.5 * on), SECTORS), 1)
+    filled = np.zeros(sectors, np.bool_)
+    for i in range(on):
+        filled[int(turn[i] * sectors) % sectors] = True
     # A sector between two filled ones counts as filled, because points have gaps.
     count = 0
-    for k in range(SECTORS):
-        both = filled[k - 1] and filled[(k + 1) % SECTORS]
+    for k in range(sectors):
+        both = filled[k - 1] and filled[(k + 1) % sectors]
         count += filled[k] or both
-    return 2.0 * np.pi * count / SECTORS, on
+    return 2.0 * np.pi * count / sectors, float(on)
 
 
 @compiled
@@ -312,6 +319,15 @@ def points_around(slices: Slices, first: int, last: int, x: float, y: float, rea
 # --- columns and the circles along them ---
 
 LEAST = 12  # points on a circle; with fewer, chance places circles above one another
+ENOUGH = 2 * LEAST  # points that a slice of a sparse cloud shall have
+MORE = 4  # steps (0.8 m) up and down from which a slice may take points; a stem hardly tapers within them
+OWN = 3  # points on the circle at the height of the slice itself, which no neighbour can replace
+VOTES = LEAST / 2.0  # of the first circle; points with the noise of a mobile scanner have half a vote each
+SAMPLE = 32  # columns in which the cloud is measured
+CLEAR = 10.0  # contrast of a circle with hardly a point beside it
+EXACT = 0.01  # m; a scatter down to this is bark, and not a property of the scanner
+FUZZY = 1.75  # largest scatter of a circle as a multiple of the noise; foliage around a stem adds to it
+UNROUND = 0.05  # scatter by the shape of a cross-section, as a share of the radius
 ARC = np.radians(70.0)  # least arc of a circle of a stem
 HOLLOW = 0.25  # largest share of points inside of a circle
 NOISE = 0.03  # m; noise of mobile scanners
@@ -319,6 +335,11 @@ ALIKE = 0.3  # largest change of centre and radius between neighbouring slices, 
 LOST = 5  # slices (1 m) without a circle after which a stem ends
 #: m; radius of a crown. In a stand, something within it is as high as the cloud is there.
 CROWN = 3.0
+#: Steps of the heights of the first circle: all in which columns are found; those around breast height, in
+#: which a wrong lean of the axis shifts a thin stem by less than its radius; and those of a stump.
+WINDOWS = np.array([[0, round((HIGH * SLICE - LOWEST) / STEP)], [3, 8], [0, 3]])
+#: m; the maximum radius of the first circle is halved down to this. Few other points are near a thin stem.
+THIN_STEM = 0.14
 OFTEN = 50.0  # number of scans in which a column counts as present
 
 
@@ -326,9 +347,9 @@ def upper_end(points: Float32, ground: TerrainRaster) -> Float:
     """Return the height above the ground up to which each cell of the raster of the ground was observed,
     shape (columns, rows) [m]; -inf far from all points.
 
-    It is the height of the highest point within CROWN. Where a level plane cuts the cloud, this is the point
-    with the largest z, and where the cut follows the ground that with the largest height above the ground;
-    the lower one counts.
+    It is the height of the highest point within CROWN. The two highest points of each cell do not count:
+    single points are noise. Where a level plane cuts the cloud, this is the point with the largest z, and
+    where the cut follows the ground that with the largest height above the ground; the lower one counts.
 
     Args:
         points: Points of all heights: x, y, z and height above the ground, shape (N, 4) [m].
@@ -337,14 +358,21 @@ def upper_end(points: Float32, ground: TerrainRaster) -> Float:
     from scipy.ndimage import maximum_filter
 
     highest = np.full((*ground.height.shape, 2), -np.inf)
-    np.maximum.at(highest, tuple(ground.cell_of(points[:, :2]).T), points[:, 2:])
+    cell = np.ravel_multi_index(tuple(ground.cell_of(points[:, :2]).T), ground.height.shape)
+    for k in range(2):
+        order = np.lexsort((points[:, 2 + k], cell))
+        c = cell[order]
+        third = np.flatnonzero(
+            (c[2:] == c[:-2]) & np.append(c[3:] != c[:-3], np.ones(1, np.bool_))[: len(c[2:])]
+        )
+        highest.reshape(-1, 2)[c[third], k] = points[order[third], 2 + k]
     side = 2 * round(CROWN / ground.cell) + 1
     z, height = np.moveaxis(maximum_filter(highest, size=(side, side, 1)), 2, 0)
-    end: Float = np.minimum(height, z - ground.height)
-    return end
+    upper: Float = np.minimum(height, z - ground.height)
+    return upper
 
 
-def find_columns(points: Float32, ground: TerrainRaster, end: Float) -> Iterator[tuple[Float, Float]]:
+def find_columns(points: Float32, ground: TerrainRaster, end: Float) -> Iterator[tuple[Float, Float, Float]]:
     """Yield the upright columns of voxels, and their features for the random forest, by square tiles.
 
     A whole cloud is treated as if a robot had seen it from everywhere: each position was visible up to the
@@ -358,7 +386,8 @@ def find_columns(points: Float32, ground: TerrainRaster, end: Float) -> Iterator
 
     Yields:
         Axes: x, y at 1.3 m above the ground [m], shift in x and y per metre of height, strength, shape (K,
-            5); and features, shape (K, COUNT). A tile without a column gives no rows.
+            5); features, shape (K, COUNT); and features as if nothing had been observed above the highest
+            return of each column, same shape. A tile without a column gives no rows.
     """
     memory = VoxelMap.empty()
     room = 1 << max(len(points) - 1, 0).bit_length()  # a full map would forget voxels; there is one per point
@@ -367,46 +396,84 @@ def find_columns(points: Float32, ground: TerrainRaster, end: Float) -> Iterator
         mean, returns = memory.around(tile, MARGIN)
         axis, profiles = examine(mean, returns, tile * TILE, TILE)
         n = len(axis)
-        row = np.zeros((n, COUNT))
-        visible = np.arange(SLICES) * SLICE < end[tuple(ground.cell_of(axis[:, :2]).T)][:, None]
         met = profiles[:, :, 0] > 0.0
-        features(
-            axis, profiles, SLICE * visible.sum(axis=1), np.full(n, OFTEN), np.zeros(n),
-            met.astype(np.int32), (visible & ~met).astype(np.int32), row,
-        )  # fmt: skip
-        yield axis, row
+        own = (SLICES - met[:, ::-1].argmax(axis=1)) * SLICE * met.any(axis=1)
+        rows = np.zeros((2, n, COUNT))
+        for viewed, row in zip((end[tuple(ground.cell_of(axis[:, :2]).T)], own), rows, strict=True):
+            visible = np.arange(SLICES) * SLICE < viewed[:, None]
+            features(
+                axis, profiles, SLICE * visible.sum(axis=1), np.full(n, OFTEN), np.zeros(n),
+                met.astype(np.int32), (visible & ~met).astype(np.int32), row,
+            )  # fmt: skip
+        yield axis, *rows
 
 
-def strongest_first(tiles: Sequence[tuple[Float, Float]]) -> tuple[Float, Float]:
-    """Return axes, shape (K, 5), and features, shape (K, COUNT), of the columns of all tiles (results of
-    `find_columns`), strongest first; without tiles, no rows."""
-    axes = np.concatenate([np.zeros((0, 5)), *(axes for axes, _ in tiles)])
-    rows = np.concatenate([np.zeros((0, COUNT)), *(rows for _, rows in tiles)])
+def strongest_first(tiles: Sequence[tuple[Float, Float, Float]]) -> tuple[Float, Float, Float]:
+    """Return the columns of all tiles (results of `find_columns`), strongest first: axes, shape (K, 5), and
+    both tables of features, shape (K, COUNT); without tiles, no rows."""
+    empty = (np.zeros((0, 5)), np.zeros((0, COUNT)), np.zeros((0, COUNT)))
+    axes, rows, unseen = (np.concatenate(parts) for parts in zip(empty, *tiles, strict=True))
     order = np.argsort(-axes[:, 4], kind="stable")
-    return axes[order], rows[order]
+    return axes[order], rows[order], unseen[order]
 
 
-def trace(slices: Slices, axes: Float, r_min: float, r_max: float) -> Float:
+class Sampling(NamedTuple):
+    """How a cloud shows the surface of a stem.
+
+    Attributes:
+        noise: Scatter of the points of a clear circle [m].
+        few: A slice with fewer points may be fitted with points of its neighbours.
+    """
+
+    noise: float
+    few: int
+
+
+def measure_sampling(slices: Slices, axes: Float, r_min: float, r_max: float) -> Sampling:
+    """Return the median scatter of the clear circles along the first SAMPLE columns, at least EXACT, and the
+    number of points below which a slice takes points of its neighbours: ENOUGH if half of these circles have
+    fewer points, else LEAST. Without a clear circle the scatter is NOISE.
+
+    In a dense cloud a slice with few points is the edge of a bush rather than a stem.
+
+    Args:
+        slices: Slices of the plot.
+        axes: Columns, strongest first, see `find_columns`.
+        r_min, r_max: Minimum and maximum radius [m].
+    """
+    circles = trace(slices, axes[:SAMPLE], r_min, r_max, Sampling(NOISE, LEAST))
+    with np.errstate(invalid="ignore"):
+        clear = circles[circles[..., 10] > CLEAR]
+    if not len(clear):
+        return Sampling(NOISE, LEAST)
+    scatter, points = np.median(clear[:, [7, 9]], axis=0).tolist()
+    return Sampling(max(scatter, EXACT), ENOUGH if points < ENOUGH else LEAST)
+
+
+def trace(slices: Slices, axes: Float, r_min: float, r_max: float, sampling: Sampling) -> Float:
     """Return the circles along the axes of K columns in each of S slices, with the values of `fit_circle`,
     shape (K, S, FIGURES); NaN in slices without a circle. After more than LOST slices in a row without a
     circle none follows; a column without a first circle has none.
 
-    The first circle is that of all points up to the height in which columns are found, moved along the axis
-    to breast height. From there the circle of each slice is fitted, upwards and downwards; it begins with the
-    last one, moved along the axis. This is done with the points near the axis, where a thin stem is not
-    outnumbered by its surroundings, and with those of twice and four times the radius. Of these three
-    results, the one with the largest sum of visible arcs is returned.
+    The first circle is that of all points in one of the WINDOWS of heights, moved along the axis to breast
+    height. From there the circle of each slice is fitted, upwards and downwards; it begins with the last one,
+    moved along the axis. This is done for each window, and with the points within twice the maximum radius of
+    the axis, half of it, and so on down to THIN_STEM. Of these results, the one with the largest sum of
+    visible arcs is returned; windows after one whose sum is half of the largest possible are not tried.
 
     Args:
         slices: Slices of the plot.
         axes: Columns, see `find_columns`.
         r_min, r_max: Minimum and maximum radius [m].
+        sampling: Result of `measure_sampling`.
     """
-    return _trace(slices, axes, slice_heights(), r_min, r_max)
+    return _trace(slices, axes, slice_heights(), r_min, r_max, sampling)
 
 
 @compiled
-def _trace(slices: Slices, axes: Float, height: Float, r_min: float, r_max: float) -> Float:
+def _trace(
+    slices: Slices, axes: Float, height: Float, r_min: float, r_max: float, sampling: Sampling
+) -> Float:
     """Return the circles along the axes of K columns, see `trace`, shape (K, S, FIGURES); NaN for slices
     without a circle and for columns without a first circle.
 
@@ -415,51 +482,94 @@ def _trace(slices: Slices, axes: Float, height: Float, r_min: float, r_max: floa
         axes: Axes of the columns, see `find_columns`.
         height: Result of `slice_heights`: heights of S slices above the ground, shape (S,) [m].
         r_min, r_max: Minimum and maximum radius [m].
+        sampling: Noise and density of the points.
     """
     out = np.full((axes.shape[0], height.shape[0], FIGURES), np.nan)
     circles = np.empty((height.shape[0], FIGURES))
+    breast = int(np.argmin(np.abs(height - BREAST)))
+    row = np.empty(FIGURES)
     for s in range(axes.shape[0]):
-        most = 0.0
-        for part in (4.0, 2.0, 1.0):
-            largest = max(r_max / part, r_min)
-            circles[:] = np.nan
-            _trace_column(slices, axes[s], height, r_min, largest, r_max, circles)
-            seen = np.nansum(circles[:, 8])
-            if seen > most:
-                most = seen
-                out[s] = circles
+        axis, most = axes[s], 0.0
+        known = np.zeros((0, 3))
+        for w in range(WINDOWS.shape[0]):
+            if most > np.pi * height.shape[0]:  # half of 2 pi in each slice
+                break
+            largest = r_max
+            while largest == r_max or largest >= max(THIN_STEM, r_min):
+                found = _first_circle(slices, axis, WINDOWS[w], r_min, largest, row)
+                largest *= 0.5
+                row[:2] += axis[:2] + axis[2:4] * (height[breast] - BREAST)
+                if not found or _is_close(known, row):
+                    continue
+                known = np.concatenate((known, row[:3].copy().reshape(1, 3)))
+                circles[:] = np.nan
+                _trace_column(slices, axis, breast, row, r_min, r_max, sampling, circles)
+                seen = np.nansum(circles[:, 8])
+                if seen > most:
+                    most = seen
+                    out[s] = circles
     return out
 
 
 @compiled
+def _first_circle(slices: Slices, axis: Float, window: Int, r_min: float, largest: float, row: Float) -> bool:
+    """Set the first values of `row` to x and y from the axis and the radius of the circle of all points in a
+    window of heights, moved along the axis; return whether there is one.
+
+    Args:
+        slices: Slices of the plot.
+        axis: Axis of the column, see `find_columns`.
+        window: First step of the heights, and one past the last.
+        r_min, largest: Minimum and maximum radius [m].
+        row: Changed in place.
+    """
+    shifted = np.zeros((0, 2))
+    for step in range(window[0], window[1]):
+        at = axis[:2] + axis[2:4] * (LOWEST + (step + 0.5) * STEP - BREAST)
+        # The axis of a column is inside of the stem or on its bark.
+        near = points_around(slices, step, step + 1, at[0], at[1], 2.0 * largest + SIDE)
+        shifted = np.concatenate((shifted, near - at))
+    return bool(shifted.shape[0] >= LEAST and best_circle(shifted, NOISE, r_min, largest, row) >= VOTES)
+
+
+@compiled
+def _is_close(known: Float, row: Float) -> bool:
+    """Return whether a circle differs from one of the known ones, shape (N, 3), by less than BARK in x, y and
+    radius, so that the same stem is traced from it."""
+    close = False
+    for k in range(known.shape[0]):
+        close |= bool(np.abs(known[k] - row[:3]).max() < BARK)
+    return close
+
+
+@compiled
 def _trace_column(
-    slices: Slices, axis: Float, height: Float, r_min: float, largest: float, r_max: float, circles: Float
+    slices: Slices,
+    axis: Float,
+    breast: int,
+    first: Float,
+    r_min: float,
+    r_max: float,
+    sampling: Sampling,
+    circles: Float,
 ) -> None:
     """Fill the circles along an axis, see `trace`.
 
     Args:
         slices: Slices of the plot.
         axis: Axis of the column, see `find_columns`.
-        height: Result of `slice_heights`.
-        r_min, largest, r_max: Minimum radius, and maximum radius of the first circle and of all others [m].
+        breast: Index of the slice at breast height.
+        first: x, y and radius of the first circle, at breast height [m].
+        r_min, r_max: Minimum and maximum radius [m].
+        sampling: Noise and density of the points.
         circles: NaN, shape (S, FIGURES), changed in place.
     """
-    row, shifted = np.empty(FIGURES), np.zeros((0, 2))
-    for step in range(int((HIGH * SLICE - LOWEST) / STEP)):
-        at = axis[:2] + axis[2:4] * (LOWEST + (step + 0.5) * STEP - BREAST)
-        # The axis of a column is inside of the stem or on its bark.
-        near = points_around(slices, step, step + 1, at[0], at[1], 2.0 * largest + SIDE)
-        shifted = np.concatenate((shifted, near - at))
-    if shifted.shape[0] < LEAST or best_circle(shifted, NOISE, r_min, largest, row) < LEAST:
-        return
-    breast = int(np.argmin(np.abs(height - BREAST)))
-    x, y = axis[:2] + axis[2:4] * (height[breast] - BREAST) + row[:2]
-    first = row[2]
+    row = np.empty(FIGURES)
     for way in (1, -1):
-        row[0], row[1], row[2] = x, y, first
+        row[:3] = first[:3]
         k, missed = breast, 0
-        while 0 <= k < height.shape[0] and missed <= LOST:
-            if _fits(slices, k, row, r_min, r_max):
+        while 0 <= k < circles.shape[0] and missed <= LOST:
+            if _fits(slices, k, row, axis[2:4], r_min, r_max, sampling):
                 circles[k] = row
                 missed = 0
             else:
@@ -470,23 +580,73 @@ def _trace_column(
 
 
 @compiled
-def _fits(slices: Slices, k: int, row: Float, r_min: float, r_max: float) -> bool:
+def _upright(slices: Slices, k: int, more: int, row: Float, lean: Float) -> Float:
+    """Return the points near a circle that a slice has in its own steps (`more` is 0), or in the two steps
+    that are `more` steps below and above them, moved along the lean to the height of the slice, shape (M, 2)
+    [m]."""
+    out = np.zeros((0, 2))
+    for step in range(k, k + THICK):
+        at = step + more if step > k else step - more
+        if 0 <= at < _STEPS:
+            shift = lean * ((at - k - 0.5 * (THICK - 1)) * STEP)
+            near = points_around(slices, at, at + 1, row[0] + shift[0], row[1] + shift[1], 2.0 * row[2] + 0.2)
+            out = np.concatenate((out, near - shift))
+    return out
+
+
+@compiled
+def _fits(
+    slices: Slices, k: int, row: Float, lean: Float, r_min: float, r_max: float, sampling: Sampling
+) -> bool:
     """Fit the circle of a slice; return whether it can belong to the stem. If not, the position and the
-    radius are unchanged, and the other values are undefined.
+    radius are unchanged, and the other values are undefined. A slice with few points in which no circle fits
+    takes those of its neighbours, up to ENOUGH points or MORE steps.
 
     Args:
         slices: Slices of the plot.
         k: Index of the slice.
         row: Predicted x, y, radius first [m]; filled with the result, shape (FIGURES,).
+        lean: Shift of the axis per metre of height, shape (2,).
         r_min, r_max: Minimum and maximum radius [m].
+        sampling: Noise and density of the points.
+    """
+    x, y, r = row[0], row[1], row[2]
+    near = _upright(slices, k, 0, row, lean)
+    own = near.shape[0]
+    for more in range(MORE + 1):
+        if more > 0:
+            near = np.concatenate((near, _upright(slices, k, more, row, lean)))
+        full = near.shape[0] >= ENOUGH
+        if near.shape[0] >= LEAST and (more == 0 or full or more == MORE):
+            if _continues(near, own, row, r_min, r_max, sampling.noise):
+                return True
+            row[0], row[1], row[2] = x, y, r
+        if full or own >= sampling.few:
+            break
+    return False
+
+
+@compiled
+def _continues(near: Float, own: int, row: Float, r_min: float, r_max: float, noise: float) -> bool:
+    """Fit a circle; return whether it is that of a hollow cross-section like the predicted one, whose scatter
+    the noise explains.
+
+    Args:
+        near: Points, shape (N, 2) [m]; the first `own` are those of the slice itself.
+        own: Number of points of the slice.
+        row: Predicted x, y, radius first [m]; changed, shape (FIGURES,).
+        r_min, r_max: Minimum and maximum radius [m].
+        noise: Scatter of clear circles [m].
     """
     x, y, r = row[0], row[1], row[2]
     slack = ALIKE * r + NOISE
-    near = points_around(slices, k, k + THICK, x, y, 2.0 * r + 0.2)
-    good = near.shape[0] >= LEAST and fit_circle(near, slack, r_min, r_max, row)
-    good = good and np.sqrt((row[0] - x) ** 2 + (row[1] - y) ** 2) < slack and abs(row[2] - r) < slack
-    good = good and row[9] >= LEAST and row[8] >= ARC and row[7] < ALIKE * row[2]
-    good = good and share_inside(near, row[0], row[1], row[2]) <= HOLLOW
-    if not good:
-        row[0], row[1], row[2] = x, y, r
-    return good
+    return bool(
+        fit_circle(near, slack, r_min, r_max, row)
+        and np.sqrt((row[0] - x) ** 2 + (row[1] - y) ** 2) < slack
+        and abs(row[2] - r) < slack
+        and row[9] >= LEAST
+        and row[8] >= ARC
+        and row[7] < np.sqrt((FUZZY * noise) ** 2 + (UNROUND * row[2]) ** 2)
+        and share_inside(near, row[0], row[1], row[2]) <= HOLLOW
+        and _coverage(near[:own], row[0], row[1], row[2], 3.0 * row[7])[1] >= OWN
+    )

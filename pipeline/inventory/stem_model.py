@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.classification.column_extraction import BREAST
+from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES
+from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.detection.cylinder_fit import MODEL
 from pipeline.detection.verdicts import AT_LEAST, AT_MOST, Check
 from pipeline.geometry.poses import Float
@@ -21,22 +23,28 @@ BESIDE = 0.3  # m outside of a stem; bark, root flares and branches form columns
 LEAST_HIGH = 1.2  # m; least height of a stem
 FILLED = 2.0 / 3.0  # least share of the slices between the lowest and the highest with a circle
 STRAIGHT = 0.1  # largest offset from a straight axis and an even taper, as a share of the radius
+LONG = 2.4  # m; undergrowth is lower, so that a stem of this traced height needs no votes
 LEAST_CONTRAST = 2.5  # ratio of densities on the surface and next to it; uniform points give 1 to 1.5
+DOUBTED_CONTRAST = 2.0 * LEAST_CONTRAST  # of a short stem that the votes do not support; chance gives up to 4
 WIDENS = 0.02  # m of radius per metre of height; stems become thinner upwards
 SURE = 0.5  # share of the votes for pole, person or wall that rejects a stem
 
+TOP, HEADROOM, LOOKED = (NAMES.index(name) for name in ("highest return", "headroom", "looked at up to"))
+
 #: Model of a stem. Position [m], lean (shift per metre of height), radius [m] and taper (change of the radius
 #: per metre of height) are those at breast height; `near` is the distance of the nearest slice from it [m].
-#: `first` and `last` are the heights of the lowest and highest slice [m], `slices` their number. The visible
-#: arc `coverage` [rad], `points`, `scatter` [m] and `contrast` are medians over the slices, see `fit_circle`;
+#: `taper_sigma` is the standard deviation of the taper, `first` and `last` are the heights of the lowest and
+#: highest slice [m], `slices` their number. The visible arc `coverage` [rad], `points`, `scatter` [m] and
+#: `contrast` are medians over the slices near breast height, see `fit_circle`;
 #: `crooked` and `uneven` are the median distances of the centres from a straight axis and of the radii from a
-#: cone [m].
+#: cone beyond the errors of the fits [m].
 STEM = np.dtype(
     [
         (name, np.float64)
         for name in (
-            "x", "y", "lean_x", "lean_y", "radius", "taper", "var_x", "var_y", "radius_sigma", "near",
-            "first", "last", "slices", "coverage", "points", "scatter", "contrast", "crooked", "uneven",
+            "x", "y", "lean_x", "lean_y", "radius", "taper", "taper_sigma", "var_x", "var_y", "radius_sigma",
+            "near", "first", "last", "slices", "coverage", "points", "scatter", "contrast", "crooked",
+            "uneven",
         )
     ]
 )  # fmt: skip
@@ -109,17 +117,22 @@ def _describe(stem: Any, rows: Float, h: Float) -> None:  # noqa: ANN401 - a row
     weight = local[:, 8] * (1.0 - (away[near] / width) ** 2) ** 2
     stem["x"], stem["lean_x"], sigma_x, _ = fit_line(at, local[:, 0].copy(), weight)
     stem["y"], stem["lean_y"], sigma_y, _ = fit_line(at, local[:, 1].copy(), weight)
-    stem["radius"], stem["taper"], sigma_r, _ = fit_line(at, local[:, 2].copy(), weight)
+    stem["radius"], stem["taper"], sigma_r, sigma_t = fit_line(at, local[:, 2].copy(), weight)
     # Neighbours share half of their points; the sigma of the fit is that of a single slice.
     floor = np.median(local[:, 3] + local[:, 5]) / (2.0 * len(local)) + MODEL**2
     stem["var_x"], stem["var_y"] = 2.0 * sigma_x**2 + floor, 2.0 * sigma_y**2 + floor
     stem["radius_sigma"] = np.sqrt(2.0 * sigma_r**2 + np.median(local[:, 6]) / len(local) + MODEL**2)
+    stem["taper_sigma"] = np.sqrt(2.0) * sigma_t  # neighbours share half of their points
     stem["near"], stem["first"], stem["last"] = away.min(), h.min(), h.max()
     stem["coverage"] = np.median(local[:, 8])
-    stem["scatter"], stem["points"], stem["contrast"] = np.median(rows[:, [7, 9, 10]], axis=0)
+    stem["scatter"], stem["points"], stem["contrast"] = np.median(local[:, [7, 9, 10]], axis=0)
     axis = np.array([stem["x"], stem["y"], stem["radius"]])
     off = local[:, :3] - axis - (at[:, None] - BREAST) * [stem["lean_x"], stem["lean_y"], stem["taper"]]
-    stem["crooked"], stem["uneven"] = np.median(np.hypot(*off[:, :2].T)), np.median(np.abs(off[:, 2]))
+    crooked, uneven = np.median(np.hypot(*off[:, :2].T)), np.median(np.abs(off[:, 2]))
+    # The error of a single circle is no property of the stem: the median of normal errors is removed.
+    by_noise = np.median(0.5 * (local[:, 3] + local[:, 5])), np.median(local[:, 6])
+    stem["crooked"] = np.sqrt(max(crooked**2 - 2 * np.log(2.0) * by_noise[0], 0.0))
+    stem["uneven"] = np.sqrt(max(uneven**2 - 0.6745**2 * by_noise[1], 0.0))
 
 
 def classify_stems(stems: Stems, share: Float, r_min: float, r_max: float) -> Int32:
@@ -153,15 +166,26 @@ def stem_checks(stems: Stems, share: Float, r_min: float, r_max: float) -> tuple
         r_min, r_max: Minimum and maximum radius of a tree [m].
     """
     r, span, contrast = stems["radius"], stems["last"] - stems["first"], stems["contrast"]
-    taper = stems["taper"]
-    filled = stems["slices"] / (span / STEP + 1.0)
+    taper = stems["taper"] - stems["taper_sigma"]  # what is sure of it
+    upright = share[:, [CLASSES.index(Verdict.TREE), CLASSES.index(Verdict.POLE)]].sum(axis=1)
+    doubted = (upright < SURE) & (span < LONG)
+    surface = np.minimum(contrast / DOUBTED_CONTRAST, stems["coverage"] / np.pi)
+    filled = stems["slices"] / (np.rint(span / STEP) + 1.0)
     checks = [
-        Check(Verdict.TOO_THIN, "radius", "m", r, AT_LEAST, r_min, "detection.radius_min"),
-        Check(Verdict.TOO_THICK, "radius", "m", r, AT_MOST, r_max, "detection.radius_max"),
+        Check(Verdict.TOO_THIN, "radius", "m", np.maximum(r, 0.0), AT_LEAST, r_min, "detection.radius_min"),
+        Check(Verdict.TOO_THICK, "radius", "m", r, AT_MOST, r_max, "detection.cloud_radius_max"),
         Check(Verdict.TOO_LOW, "traced height", "m", span, AT_LEAST, LEAST_HIGH),
         Check(Verdict.OTHER, "distance of a slice from breast height", "m", stems["near"], AT_MOST, LOCAL),
         Check(Verdict.BUSH, "share of slices", "", filled, AT_LEAST, FILLED),
         Check(Verdict.BUSH, "contrast", "", contrast, AT_LEAST, LEAST_CONTRAST),
+        Check(
+            Verdict.BUSH,
+            "contrast or arc of a short stem without votes, share of the limit",
+            "",
+            np.where(doubted, surface, np.nan),
+            AT_LEAST,
+            1.0,
+        ),
         Check(Verdict.BUSH, "radius gained per metre", "m", taper, AT_MOST, WIDENS),
     ]
     limit = STRAIGHT * r + MODEL
@@ -178,6 +202,48 @@ def stem_checks(stems: Stems, share: Float, r_min: float, r_max: float) -> tuple
         votes = share[:, CLASSES.index(kind)]
         checks.append(Check(kind, f"votes for {kind.label}", "", votes, AT_MOST, SURE))
     return tuple(checks)
+
+
+def ends_are_seen(stems: Stems, features: Float, r_min: float, r_max: float) -> Bool:
+    """Return whether the space above each column was observed, so that the end of a column is the end of an
+    object, shape (K,).
+
+    A scanner that does not look up, such as a phone, sees each stem to another height. Where the view ends
+    within the heights that the features describe, the headroom above the round stems shows by how much it
+    varies: up to three standard deviations, by the median, an end shows nothing. Nearly all stems of a cloud
+    that sees the crowns, or that a plane cuts, reach the upper end of the view.
+
+    Args:
+        stems: Result of `describe_stems`, shape (K,).
+        features: Features of the columns, see `find_columns`, shape (K, COUNT).
+        r_min, r_max: Minimum and maximum radius of a tree [m].
+    """
+    headroom, limited = features[:, HEADROOM], features[:, LOOKED] < SLICES * SLICE - 0.5 * SLICE
+    known = limited & np.isfinite(stems["radius"])
+    no_votes = np.full((len(stems), len(CLASSES)), SURE)
+    for check in stem_checks(stems, no_votes, r_min, r_max):
+        known &= ~check.fails
+    spread = float(np.median(headroom[known])) / 0.6745 if known.any() else 0.0
+    return np.asarray(~limited | (headroom > 3.0 * spread))
+
+
+def are_stumps(stems: Stems, features: Float, share: Float, r_min: float, r_max: float) -> Bool:
+    """Return which candidates are stumps, shape (K,): round as a stem, but the highest return of the column
+    is below breast height.
+
+    Args:
+        stems: Result of `describe_stems`, shape (K,).
+        features: Features of the columns, see `find_columns`, shape (K, COUNT).
+        share: Shares of the votes of the random forest, in the order of CLASSES, shape (K, 6).
+        r_min, r_max: Minimum and maximum radius of a tree [m].
+    """
+    stump = (
+        np.isfinite(stems["radius"]) & (features[:, TOP] < BREAST) & (stems["contrast"] >= DOUBTED_CONTRAST)
+    )
+    for check in stem_checks(stems, share, r_min, r_max):
+        if check.verdict not in (Verdict.TOO_LOW, Verdict.OTHER, *CLASSES):
+            stump &= ~check.fails
+    return np.asarray(stump)
 
 
 def diameters(stems: Stems, arc_min: float) -> tuple[Float, Float]:

@@ -15,14 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry.poses import Float
+from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.atomic_files import UNFINISHED
 from pipeline.stand.seen_area import SeenArea
 from pipeline.types.records import Bool, Frame, HeightMap, Int, Path, Trees, Verdict
 
 ROWS = "detections.csv"  # written during the run
-# Earlier versions did not write them.
-NEW_TREE_COLUMNS = ("height_m", "sigma_height_m", "lean_deg", "review")
 #: States of a tree in the review by a person.
 OPEN, CONFIRMED, REJECTED, SKIPPED = REVIEWS = ("open", "confirmed", "rejected", "skipped")
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
@@ -225,6 +223,55 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return text.getvalue()
 
 
+def csv_in_units(text: str, unit: tuple[float, float], *, to_metres: bool = False) -> str:
+    """Return a CSV text whose columns x_m, y_m and z_m are in the units of a reference system, and named x, y
+    and z; or, of such a text, the one in metres. Other columns are not changed.
+
+    Args:
+        text: Text with a header.
+        unit: Metres per unit of x and y, and of z; for 1, 1 the text is returned as it is.
+        to_metres: Whether x, y and z become x_m, y_m and z_m.
+
+    Raises:
+        ValueError: A cell of these columns is neither empty nor a number, or a row is too short.
+    """
+    rows = list(csv.reader(io.StringIO(text)))
+    if unit == (1.0, 1.0) or not rows:
+        return text
+    names = {"x": "x_m", "y": "y_m", "z": "z_m"} if to_metres else {"x_m": "x", "y_m": "y", "z_m": "z"}
+    factors = {
+        k: (unit[0] if name[0] in "xy" else unit[1]) ** (1 if to_metres else -1)
+        for k, name in enumerate(rows[0])
+        if name in names
+    }
+    if any(len(row) != len(rows[0]) for row in rows):
+        raise ValueError("a row is too short")
+    cells = [
+        [
+            number_text(float(cell) * factors[k], 3) if k in factors and cell else cell
+            for k, cell in enumerate(row)
+        ]
+        for row in rows[1:]
+    ]
+    return csv_text([names.get(name, name) for name in rows[0]], cells)
+
+
+#: Poses of the LiDAR by LiDAR odometry, as TUM rows.
+ODOMETRY = "odometry.tum"
+
+
+def tum_text(poses: Iterable[tuple[int, Pose3]]) -> str:
+    """Return poses at times [ns] as TUM rows, which `read_tum_poses` reads: t [s], x, y, z [m], qx, qy, qz,
+    qw."""
+    rows = ["# t_s x_m y_m z_m qx qy qz qw"]
+    for stamp_ns, pose in poses:
+        w, x, y, z = pose.quaternion().tolist()
+        seconds = f"{'-' if stamp_ns < 0 else ''}{abs(stamp_ns) // 10**9}.{abs(stamp_ns) % 10**9:09d}"
+        numbers = (*pose.t.tolist(), x, y, z, w)
+        rows.append(" ".join((seconds, *(f"{number:.9g}" for number in numbers))))
+    return "\n".join(rows) + "\n"
+
+
 class RunFiles:
     """The output folder of `stemmap map`. Detections are written during the run, the other files at its end;
     all files appear under their names in `finish`.
@@ -232,19 +279,23 @@ class RunFiles:
     Args:
         folder: The folder, which is created if necessary; files of an earlier run are replaced.
         earlier: Folder of the run that this one continues; its detections come first.
+        unit: Metres per unit of the reference system in which positions are written, horizontal and vertical,
+            see `csv_in_units`.
 
     Raises:
         OSError: The folder cannot be created or written.
     """
 
-    def __init__(self, folder: FilePath, earlier: FilePath | None = None) -> None:
+    def __init__(
+        self, folder: FilePath, earlier: FilePath | None = None, unit: tuple[float, float] = (1.0, 1.0)
+    ) -> None:
         """Create the folder and, in it, a hidden folder for incomplete files, with the detections of the
         earlier run or a header.
 
         Raises:
             OSError: The folder cannot be created, or a file cannot be written.
         """
-        self._folder = folder
+        self._folder, self._unit = folder, unit
         self._made_folder = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
         # A separate folder, so that two runs into the same folder do not mix their files.
@@ -284,7 +335,7 @@ class RunFiles:
         further: Mapping[str, str] | None = None,
     ) -> None:
         """Write the other files and move all files to their names, `run.json` last. Files `seen.csv`,
-        `georeference.json` and (without a new state) `state.zip` of an earlier run are removed.
+        `georeference.json`, ODOMETRY and (without a new state) `state.zip` of an earlier run are removed.
 
         Args:
             trees, path: The map; confirmed trees are written.
@@ -307,10 +358,15 @@ class RunFiles:
             **(further or {}),
             "run.json": json.dumps(run, indent=1, allow_nan=False) + "\n",
         }
+        if self._unit != (1.0, 1.0):
+            texts[ROWS] = (self._staging / ROWS).read_text(encoding="utf-8")
+            texts |= {k: csv_in_units(v, self._unit) for k, v in texts.items() if k.endswith(".csv")}
         for name, text in texts.items():
             (self._staging / name).write_text(text, encoding="utf-8", newline="")
+        texts.pop(ROWS, None)
         states = [] if state is None else ["state.zip"]
-        for name in ("seen.csv", "georeference.json"):  # of an earlier run, which may have another frame
+        # Of an earlier run, which may have another frame.
+        for name in ("seen.csv", "georeference.json", ODOMETRY):
             (self._folder / name).unlink(missing_ok=True)
         if state is None:
             (self._folder / "state.zip").unlink(missing_ok=True)

@@ -15,6 +15,9 @@ LOST = (
     "the robot is lost: the map returns to the scan before the known trees disappeared, and the stems around "
     "the robot are searched for in it"
 )
+DOUBLED = (
+    "the map contradicts itself: the path has drifted since this place was left, and its trees stand twice"
+)
 DRIFT = "the path had drifted: path and map are corrected"
 NOT_FOUND = "the stems around the robot were not found in the map; mapping continues from the odometry"
 
@@ -64,16 +67,28 @@ class LoopClosure:
     Attributes:
         loop: The constraints of the path.
         stems: Number of trees by which a lost robot was located; None if it was not lost.
+        is_doubled: Whether the known trees stand a second time in the map, beside the first one.
     """
 
     loop: Loop
     stems: int | None = None
+    is_doubled: bool = False
 
     @property
     def messages(self) -> tuple[str, ...]:
         """Warnings of the scan: that a loop was closed; for a robot that was lost, that it was located and
         that the path had drifted."""
         return (LOOP,) if self.stems is None else (_located(self.stems), DRIFT)
+
+
+@dataclass(frozen=True, slots=True)
+class DoubledTrees:
+    """Trees of a known place were mapped a second time beside it, and no correction of the path was found."""
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Warnings of the scan: that the map contradicts itself."""
+        return (DOUBLED,)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,13 @@ import numpy as np
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.loop_closure.stem_matching import MapStems, find_constellation, worst_sigma
+from pipeline.loop_closure.stem_matching import (
+    LEAST,
+    MapStems,
+    find_constellation,
+    find_displacement,
+    worst_sigma,
+)
 from pipeline.slam import Loop
 from pipeline.slam.keyframe_graph import drift_of, without_jumps
 from pipeline.slam.motion import Noise
@@ -135,6 +141,66 @@ def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
     return loop_to(run, trees.number[rows[match.reference]], T, R, len(run.path) - 1)
 
 
+#: Largest drift of the odometry as a share of the driven path: LiDAR odometry drifts by 0.5 to 1 % of it,
+#: wheels by 1 to 2 %.
+DRIFT_SHARE = 0.02
+UNSEEN = 2.0  # m of the path; a tree that was seen on it still has its detections
+LEAST_DISPLACEMENT = 0.2  # m; the association of the filter tolerates less
+
+
+def find_displaced(run: RunHistory, parameters: Relocalisation) -> Loop | None:
+    """Search for a loop that ends at the newest scan by trees that stand twice in the map, next to one
+    another.
+
+    A drift that is larger than the gate of the data association and smaller than the distance between trees
+    begins each tree of a known place a second time. Confirmed trees that were begun in the last LATELY metres
+    are compared with older ones that are not seen any more, though the robot is among them. The displacement
+    is at most DRIFT_SHARE of the path since these were begun, and half the distance between trees.
+
+    Args:
+        run: Path and map with at least one scan; unchanged.
+        parameters: Parameters of the stage.
+
+    Returns:
+        The loop; None if either side has fewer than LEAST stems, no displacement is found (see
+        `find_displacement`), it is below LEAST_DISPLACEMENT, or half as many known trees as agree are seen at
+        their places.
+    """
+    way, trees = _way(run.path), run.trees
+    lately = max(int(np.searchsorted(way, way[-1] - LATELY)), run.placed)
+    T_map_base = run.estimate.T_map_base
+    near = trees.confirmed & (np.hypot(*(trees.position - T_map_base.as_array()[:2]).T) < REACH)
+    left, begun = run.scan_of(trees.last_seen_ns), run.scan_of(trees.first_seen_ns)
+    known = near & (begun < lately)
+    is_seen = way[left] >= way[-1] - UNSEEN
+    old = np.flatnonzero(known & ~is_seen)
+    new = np.flatnonzero(near & (begun >= lately))
+    if min(len(old), len(new)) < LEAST:
+        return None
+    drift = DRIFT_SHARE * float(way[-1] - way[begun[old]].min())
+    flat = trees.covariance[:, [0, 0, 1], [0, 1, 1]]
+    match = find_displacement(
+        _stems(trees.position[new], flat[new]),
+        _stems(trees.position[old], flat[old]),
+        parameters,
+        min(drift, 0.5 * _spacing(trees.position[old])),
+    )
+    # Known trees that are seen at their places contradict a displacement.
+    if match.pose is None or 2 * np.count_nonzero(known & is_seen) >= len(match.local):
+        return None
+    T, R = through(match.pose, match.covariance, T_map_base, OWN)
+    if np.hypot(T.x - T_map_base.x, T.y - T_map_base.y) < LEAST_DISPLACEMENT:
+        return None
+    return _loop(run, lately, T, R)
+
+
+def _spacing(position: Float) -> float:
+    """Return the median distance of N > 1 positions, shape (N, 2), to their nearest neighbours [m]."""
+    from scipy.spatial import cKDTree
+
+    return float(np.median(cKDTree(position).query(position, k=2)[0][:, 1]))
+
+
 def loop_to(
     run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
@@ -177,8 +243,13 @@ def loop_to(
     driven, jumps = without_jumps(path[first:], run.motion[first:])
     if jumps and _is_beyond(_gap(T_map_base, driven[-1]), since + R):
         return None
-    anchor = int(np.argmin(np.hypot(*(path[: first + 1, :2] - [T_map_base.x, T_map_base.y]).T)))
-    return Loop(first, anchor, T_map_base, R)
+    return _loop(run, first, T_map_base, R)
+
+
+def _loop(run: RunHistory, first: int, T_map_base: Pose2, R: Float) -> Loop:
+    """Return the loop to the nearest scan up to scan `first`; see `loop_to`."""
+    away = run.path[: first + 1, :2] - [T_map_base.x, T_map_base.y]
+    return Loop(first, int(np.argmin(np.hypot(*away.T))), T_map_base, R)
 
 
 def _gap(T_map_base: Pose2, pose: Float) -> Float:

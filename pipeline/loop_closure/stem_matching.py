@@ -482,6 +482,9 @@ REACH = 1.0  # m; largest distance of two stems that agree
 ROUNDS = 8  # iterations of pairing and alignment
 WIDE, WIDE_ROUNDS = 3.0, 2  # factor of the slack in the first iterations, which start from a single pair
 FALSE_ALARMS = 1e-4  # expected number of equally good agreements by chance
+# The same where the drift bounds the displacement: the trees of a place that is seen again are there, so
+# that an agreement is expected, and one of a hundred such decisions may be wrong.
+FALSE_ALARMS_NEAR = 1e-2
 SECOND_BEST = 0.7  # largest ratio of the agreements of the second best pose and the best one
 LEAD = 3  # least difference of their numbers
 SIGMA_XY, SIGMA_YAW = 0.5, 0.05  # m, rad; largest standard deviations of the pose
@@ -523,8 +526,33 @@ def find_constellation(
         parameters: Parameters of this stage.
         hypotheses: Number of hypotheses after which no further pair of local stems is tried.
     """
+    return _matched(local, reference, parameters, hypotheses, None)
+
+
+def find_displacement(
+    local: MapStems, reference: MapStems, parameters: Relocalisation, reach: float
+) -> Match:
+    """Return the pose of local stems in a reference map from which drift has displaced them by at most a
+    distance, or the reason of a refusal; see `find_constellation`.
+
+    A hypothesis moves one local stem to one stem of the map without a rotation. They are few, so that LEAST
+    stems suffice.
+
+    Args:
+        local: Stems in the frame of the map with the drift.
+        reference: Stems in the frame of the map.
+        parameters: Parameters of this stage; `stems_min` is not used.
+        reach: Largest displacement of a stem [m]; above half the distance between trees it is ambiguous.
+    """
+    return _matched(local, reference, parameters, 0, reach)
+
+
+def _matched(
+    local: MapStems, reference: MapStems, parameters: Relocalisation, most: int, reach: float | None
+) -> Match:
+    """Return the result of a search; see `_Search` for `most` and `reach`."""
     rows, map_rows = np.flatnonzero(local.usable()), np.flatnonzero(reference.usable())
-    search_ = _Search(local.take(rows), reference.take(map_rows), parameters, hypotheses)
+    search_ = _Search(local.take(rows), reference.take(map_rows), parameters, most, reach)
     best, second = search_.best_two()
     if best is None:
         none = np.zeros(0, np.int64)
@@ -560,13 +588,21 @@ class _Candidate:
 class _Search:
     """One search. The local stems are centred at their mean, which decouples rotation and translation."""
 
-    def __init__(self, local: MapStems, reference: MapStems, parameters: Relocalisation, most: int) -> None:
+    def __init__(
+        self,
+        local: MapStems,
+        reference: MapStems,
+        parameters: Relocalisation,
+        most: int,
+        reach: float | None,
+    ) -> None:
         """Prepare a search.
 
         Args:
             local, reference: Usable stems of the constellation and of the map.
             parameters: Parameters of the stage.
             most: Number of hypotheses after which no further pair of local stems is tried.
+            reach: Largest displacement of a local stem [m], see `find_displacement`; None for any pose.
         """
         self.reason: Refusal = "too few stems"
         self._p = parameters
@@ -574,29 +610,46 @@ class _Search:
         self._local = MapStems(local.position - self._mean, local.sigma, local.dbh, local.dbh_sigma)
         self._reference = reference
         self._most, self._looked = most, 0
+        self._reach = reach
+        self._least = parameters.stems_min if reach is None else LEAST
 
     def best_two(self) -> tuple[_Candidate | None, _Candidate | None]:
         """Return the pose in which most stems agree, and the best pose with other pairs (`is_same`), both of
         the local stems about their mean. None for each that does not exist; without the first one, `reason`
         is "too few stems" or "no agreement"."""
-        local, reference, p = self._local, self._reference, self._p
-        if min(len(local), len(reference)) < p.stems_min:
+        if min(len(self._local), len(self._reference)) < self._least:
             return None, None
         self.reason = "no agreement"
-        base, _ = pairs_within(local.position, SHORTEST, LONGEST, MOST_PAIRS)
-        pair, length = pairs_within(reference.position, SHORTEST - 1.0, LONGEST + 1.0, MOST_PAIRS)
-        if not len(base) or not len(pair):
-            return None, None
-        self._grid = cells_of(reference.position, REACH)
-        rough, _, self._looked = search(
-            *self._columns(local), _evenly(base), *self._columns(reference), pair, length, *self._grid,
-            p.slack, REACH, LEAST, self._most,
-        )  # fmt: skip
+        rough = self._of_pairs() if self._reach is None else self._displaced(self._reach)
         refined = sorted((self._refined(pose) for pose in rough), key=lambda c: -c.found)
         if not refined or refined[0].found < LEAST:
             return None, None
         best = refined[0]
         return best, next((c for c in refined[1:] if not c.is_same(best)), None)
+
+    def _displaced(self, reach: float) -> Float:
+        """Return the hypotheses of `find_displacement`, x, y [m], yaw [rad] of the local stems about their
+        mean, shape (H, 3)."""
+        away = self._reference.position[None] - (self._local.position + self._mean)[:, None]
+        away = away[np.hypot(away[..., 0], away[..., 1]) <= reach]
+        self._looked = len(away)
+        self._grid = cells_of(self._reference.position, REACH)
+        return np.column_stack([self._mean + away, np.zeros(len(away))])
+
+    def _of_pairs(self) -> Float:
+        """Return the best hypotheses of `find_constellation`, as `_displaced`."""
+        local, reference, p = self._local, self._reference, self._p
+        base, _ = pairs_within(local.position, SHORTEST, LONGEST, MOST_PAIRS)
+        pair, length = pairs_within(reference.position, SHORTEST - 1.0, LONGEST + 1.0, MOST_PAIRS)
+        if not len(base) or not len(pair):
+            return np.zeros((0, 3))
+        self._grid = cells_of(reference.position, REACH)
+        rough: Float
+        rough, _, self._looked = search(
+            *self._columns(local), _evenly(base), *self._columns(reference), pair, length, *self._grid,
+            p.slack, REACH, LEAST, self._most,
+        )  # fmt: skip
+        return rough
 
     def checked(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
         """Return the pose T_reference_local, its covariance, shape (3, 3), the decimal logarithm of the false
@@ -634,9 +687,9 @@ class _Search:
             inside: Number of local stems with a stem of the map within WINDOW.
             covariance: Covariance of the pose at the mean of the local stems, shape (3, 3).
         """
-        if found < self._p.stems_min:
+        if found < self._least:
             return "too few stems"
-        if chance > np.log10(FALSE_ALARMS):
+        if chance > np.log10(FALSE_ALARMS if self._reach is None else FALSE_ALARMS_NEAR):
             return "could be chance"
         if second > SECOND_BEST * found or second > found - LEAD:
             return "ambiguous"
@@ -691,4 +744,4 @@ def _log10_false_alarms(tests: int, trials: int, hits: int, p: float) -> float:
     return float(np.log10(max(tests, 1)) + max(tail, -300.0))
 
 
-__all__ = ["MapStems", "Match", "Refusal", "find_constellation"]
+__all__ = ["MapStems", "Match", "Refusal", "find_constellation", "find_displacement"]

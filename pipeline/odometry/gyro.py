@@ -33,6 +33,7 @@ CONTRADICTION, CONTRADICTION_LEAST = 4.0, 0.01  # sigma, rad
 PROOF, ALIKE = 0.1, 3.0  # turn by the wheels [rad] and largest ratio for the gyroscope to agree with them
 HALF_TRACK = 0.5  # m; slip of the wheels per angle of a wrong turn
 SLIPPED = "the turns of the wheels and the gyroscope differ: the wheels slip"
+UNUSED = "the turns of the LiDAR odometry and the gyroscope differ: the gyroscope is not used there"
 
 
 class Gyro:

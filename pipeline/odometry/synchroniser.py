@@ -10,9 +10,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.geometry.poses import Pose2, Pose3, interpolate, wrap_angle
+from pipeline.geometry.poses import Float, Pose2, Pose3, interpolate, wrap_angle
 from pipeline.odometry.gyro import Gyro
 from pipeline.types.records import (
+    Bool,
     Imu,
     Notice,
     Odometry,
@@ -33,12 +34,13 @@ Tilt = tuple[float, float]  # roll, pitch [rad]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Planar odometry T_odom_base without jumps at a time [ns], and tilt: roll, pitch [rad], None for
-    odometry in the plane."""
+    """Planar odometry T_odom_base without jumps at a time [ns]; tilt: roll, pitch [rad], None for odometry in
+    the plane; and the sum of the covariances of all steps, see Odometry, None if they are unknown."""
 
     stamp_ns: int
     pose: Pose2
     tilt: Tilt | None
+    drift: Float | None
 
 
 class Jump(NamedTuple):
@@ -50,11 +52,13 @@ class Jump(NamedTuple):
 
 class Moving(NamedTuple):
     """Motion of the base at a time: T_odom_base, velocity x, y [m/s], yaw [rad/s] in the base frame, and tilt
-    (roll, pitch [rad]; None for odometry in the plane)."""
+    (roll, pitch [rad]; None for odometry in the plane) and sum of the covariances of all steps, see
+    Reading."""
 
     pose: Pose2
     twist: tuple[float, float, float]
     tilt: Tilt | None
+    drift: Float | None
 
 
 class OdometryBuffer:
@@ -92,7 +96,10 @@ class OdometryBuffer:
                 jump = Jump(distance, abs(step.yaw))
                 self._T_odom_jumped = last.pose @ raw.inverse()
                 pose = self._T_odom_jumped @ raw
-        reading = Reading(odometry.stamp_ns, pose, _tilt(odometry.T_odom_base))
+        drift = odometry.covariance
+        if drift is not None and self._readings and (earlier := self._readings[-1].drift) is not None:
+            drift = earlier + drift
+        reading = Reading(odometry.stamp_ns, pose, _tilt(odometry.T_odom_base), drift)
         self._readings.append(reading)
         self._watch_standing(reading)
         return jump
@@ -134,13 +141,15 @@ class OdometryBuffer:
         before, after = self._around(stamp_ns)
         span = (after.stamp_ns - before.stamp_ns) * 1e-9
         if span <= 0.0:
-            return Moving(after.pose, STILL, after.tilt)
+            return Moving(after.pose, STILL, after.tilt, after.drift)
         fraction = float(np.clip((stamp_ns - before.stamp_ns) * 1e-9 / span, 0.0, 1.0))
         step = before.pose.inverse() @ after.pose
         twist = (step.x / span, step.y / span, step.yaw / span)
-        return Moving(
-            interpolate(before.pose, after.pose, fraction), twist, _tilt_between(before, after, fraction)
-        )
+        drift = None
+        if before.drift is not None and after.drift is not None:
+            drift = before.drift + fraction * (after.drift - before.drift)
+        pose = interpolate(before.pose, after.pose, fraction)
+        return Moving(pose, twist, _tilt_between(before, after, fraction), drift)
 
     def _around(self, stamp_ns: int) -> tuple[Reading, Reading]:
         """Return the readings before and after a time [ns], or the two nearest ones outside of their range;
@@ -254,6 +263,8 @@ MOST_WAITING = 64
 STALE_NS = 250_000_000  # readings farther in time from a scan are not used
 JUMP_SLACK = (0.2, 0.05)  # m, rad; one sigma of the motion during a jump of the odometry
 VIEW_NS = 80_000_000  # minimum time between two views: all scans of a sensor of 10 Hz with a jitter of 20 %
+#: Number of sectors around a LiDAR, and of points from which the sectors of a scan are determined.
+_DIRECTIONS, _SIGHT_POINTS = 36, 1000
 PAUSE_NS = 10_000_000_000  # a longer time without a scan is reported
 WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion without odometry
 SETTLES_NS = 300_000_000
@@ -294,6 +305,43 @@ def steps(
     yield from joiner.ready(end=True)
 
 
+class _Sights:
+    """Times at which one LiDAR observed each sector. A driver may write half a turn or less per scan: two
+    successive scans then cover different sectors."""
+
+    def __init__(self) -> None:
+        """Begin without scans."""
+        self._seen_ns = np.full(_DIRECTIONS, -1, np.int64)
+        self._viewed_ns = np.full(_DIRECTIONS, -1, np.int64)
+
+    def add(self, scan: Scan) -> tuple[int | None, bool]:
+        """Return the time since the previous scan of the same sectors [ns], None without one, and whether the
+        scan is a view, see `Step`. Both follow from the median over the sectors of the scan."""
+        looks = _directions_of(scan)
+        seen_ns, viewed_ns = (int(np.median(ns[looks])) for ns in (self._seen_ns, self._viewed_ns))
+        is_view = viewed_ns < 0 or scan.stamp_ns - viewed_ns >= VIEW_NS
+        self._seen_ns[looks] = scan.stamp_ns
+        if is_view:
+            self._viewed_ns[looks] = scan.stamp_ns
+        return (None if seen_ns < 0 else scan.stamp_ns - seen_ns), is_view
+
+
+def _directions_of(scan: Scan) -> Bool:
+    """Return the sectors that a scan covers, shape (_DIRECTIONS,): all but a gap of a quarter turn or more
+    without a return. A scan with fewer than _SIGHT_POINTS sampled points covers all."""
+    looks = np.ones(_DIRECTIONS, np.bool_)
+    points = scan.points[:: max(len(scan.points) // _SIGHT_POINTS, 1)].astype(np.float64)
+    if len(points) < _SIGHT_POINTS:
+        return looks
+    turn = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi)
+    found = np.unique((turn * _DIRECTIONS).astype(np.int64) % _DIRECTIONS)
+    gaps = np.diff(found, append=found[0] + _DIRECTIONS) - 1
+    widest = int(np.argmax(gaps))
+    if 4 * gaps[widest] >= _DIRECTIONS:
+        looks[(found[widest] + 1 + np.arange(gaps[widest])) % _DIRECTIONS] = False
+    return looks
+
+
 class Synchroniser:
     """Takes records one by one in the order of arrival, and yields the steps that are ready.
 
@@ -312,6 +360,7 @@ class Synchroniser:
         self._imu: deque[Imu] = deque()
         self._gyro = Gyro()
         self._stepped: Pose2 | None = None  # odometry of the last step
+        self._drifted: Float | None = None  # sum of its covariances at the last step, see Reading
         self._was_bridged = False  # whether the odometry was missing at the last step
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # time [ns], roll and pitch [rad]
@@ -320,7 +369,7 @@ class Synchroniser:
         self._doubt = ""
         self._stepped_ns: int | None = None
         self._elapsed_ns = 0  # since the first scan
-        self._viewed_ns: int | None = None
+        self._sights: dict[tuple[bytes, bytes] | None, _Sights] = {}  # of each LiDAR
         self._last_stamp: int | None = None
         self._warnings: list[str] = []
 
@@ -470,10 +519,11 @@ class Synchroniser:
         self._report_pause(scan.stamp_ns)
         period_ns = 0 if self._stepped_ns is None else scan.stamp_ns - self._stepped_ns
         self._elapsed_ns += period_ns
-        is_view = self._viewed_ns is None or scan.stamp_ns - self._viewed_ns >= VIEW_NS
-        if is_view:
-            self._viewed_ns = scan.stamp_ns
-        pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
+        T = scan.T_base_lidar
+        lidar = None if T is None else (T.t.tobytes(), T.R.tobytes())
+        again_ns, is_view = self._sights.setdefault(lidar, _Sights()).add(scan)
+        pose, twist, base_tilt, drift = self._motion_at(scan.stamp_ns)
+        covariance = None if drift is None or self._drifted is None else drift - self._drifted
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
         unreported = self._unreported(scan.stamp_ns)
         turn = self._turn_to(scan.stamp_ns, pose, unreported)
@@ -489,6 +539,7 @@ class Synchroniser:
             warnings=tuple(self._warnings),
             doubt=self._doubt,
             slack=self._slack,
+            covariance=covariance,
             unreported=unreported,
             measured=self._measured.at(scan.stamp_ns, pose, odometry_at),
             turn=turn if self._gyro.proven else None,
@@ -496,11 +547,12 @@ class Synchroniser:
             elapsed_ns=self._elapsed_ns,
             period_ns=period_ns,
             is_view=is_view,
+            again_ns=again_ns,
         )
         newest = self._odometry.newest
         self._was_bridged = newest is not None and scan.stamp_ns > newest.stamp_ns + STALE_NS
         self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
-        self._stepped = pose
+        self._stepped, self._drifted = pose, drift
         self._index += 1
         self._warnings.clear()
         return step
@@ -534,9 +586,10 @@ class Synchroniser:
         self._gyro.compare(float(wrap_angle(pose.yaw - self._stepped.yaw - earlier)), turn)
         return turn
 
-    def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:
-        """Return pose, velocity in the base frame (x, y [m/s], yaw [rad/s]), and tilt by the odometry at a
-        time [ns].
+    def _motion_at(
+        self, stamp_ns: int
+    ) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None, Float | None]:
+        """Return the motion by the odometry at a time [ns], see Moving.
 
         More than STALE_NS after the last reading the last pose is returned, without motion and tilt; without
         any reading the pose is None. Both add a warning and a doubt (`_bridge`), except for None without
@@ -545,10 +598,10 @@ class Synchroniser:
         if newest is None:
             if self._use_odometry:
                 self._bridge(stamp_ns)
-            return None, STILL, None
+            return None, STILL, None, None
         if stamp_ns > newest.stamp_ns + STALE_NS:
             self._bridge(stamp_ns)
-            return newest.pose, STILL, None
+            return newest.pose, STILL, None, newest.drift
         return self._odometry.motion_at(stamp_ns)
 
     def _report_pause(self, stamp_ns: int) -> None:

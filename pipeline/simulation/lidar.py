@@ -289,6 +289,10 @@ class SpinningLidar:
         """Return the sensor with the pattern of scan k: this sensor, because all turns are alike."""
         return self
 
+    def fired(self) -> Bool:
+        """Return which columns and rings have a ray, shape (C, K): all."""
+        return np.ones((self.columns, self.rings), np.bool_)
+
     def sees(self, points: Float32) -> Bool:
         """Return which points, shape (N, 3) [m], are in the field of view, shape (N,): all."""
         return np.ones(len(points), np.bool_)

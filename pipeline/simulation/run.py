@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipeline.config import Parameters
 from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
 from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
+from pipeline.simulation.lidar_models import LIDARS
 from pipeline.simulation.robot_motion import (
     IMU_HZ,
     ODOMETRY_HZ,
@@ -122,6 +123,7 @@ class SimulatedRun:
         request, scenario = self.request, self.request.scenario
         text = f"stemmap simulation {VERSION}; {request}; {scenario}; {self._mounting()}"
         text += f"; drive {request.drive}" if request.drive else ""
+        text += f"; lidar {request.lidar}" if request.lidar else ""
         text += "; obeys" if scenario.obeys else ""
         text += f"; crossings {scenario.crossings}" if scenario.crossings else ""
         return hashlib.sha256(text.encode()).hexdigest()
@@ -151,6 +153,9 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     else:
         scene = build_scene(scenario, course, random_stream(SCENE, request))
         ground = scene.terrain
+    if request.lidar:
+        # The scene is that of the scenario with any sensor; two echoes are of spinning sensors.
+        lidar = replace(LIDARS[request.lidar], range_sigma=request.sigma, dual=lidar.dual)
     mounting = MOUNTING if T_base_lidar is None else T_base_lidar
     if scenario.obeys:
         seed = int(random_stream(SENSE, request).integers(2**31))

@@ -262,6 +262,7 @@ SCHEME = "sim:"
 EXACT = "exact"
 CLOUD = "cloud"
 #: Options of a run: type with bounds, and meaning. Times and sizes are decimal numbers without a sign.
+LIDAR_NAMES = ("vlp16", "vlp32", "os0-128", "os1-64", "xt32", "helios", "mid360", "avia", "solid")
 _OPTIONS: dict[str, tuple[Any, str]] = {
     "seed": (Annotated[int, Meta(ge=0, le=2**63 - 1)], "0 to 2^63 - 1"),
     "sigma": (Annotated[float, Meta(ge=0.0, le=0.2)], "range noise in metres, 0 to 0.2"),
@@ -269,11 +270,12 @@ _OPTIONS: dict[str, tuple[Any, str]] = {
     "duration": (Annotated[float, Meta(ge=1.0, le=3600.0)], "seconds, 1 to 3600"),
     "trees": (Annotated[int, Meta(ge=0, le=2000)], "how many, 0 to 2000"),
     "drive": (Annotated[int, Meta(ge=0, le=1000)], "another drive through the same scene, 0 to 1000"),
+    "lidar": (str, f"one of {', '.join(LIDAR_NAMES)}"),
     "file": (str, "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd"),
     "truth": (str, "a table (CSV) of its trees in the coordinates of the cloud"),
 }
 _NUMBER = re.compile(r"[-+.0-9eE]+")
-_KEYS = ("seed", "sigma", "odometry", "duration", "trees", "drive")
+_KEYS = ("seed", "sigma", "odometry", "duration", "trees", "drive", "lidar")
 _CLOUD_KEYS = ("file", "truth", "seed", "sigma", "odometry", "duration")
 
 
@@ -290,6 +292,7 @@ class RunRequest:
         trees: Number of trees; 0 for a run through a cloud.
         drive: Number of the drive; other drives through the same scene have other noise.
         file, truth: Cloud of a run through a real plot and table of its trees, or empty.
+        lidar: Name of the sensor, one of LIDAR_NAMES; "" for that of the scenario.
     """
 
     name: str
@@ -301,6 +304,7 @@ class RunRequest:
     drive: int = field(default=0, repr=False)
     file: str = ""
     truth: str = ""
+    lidar: str = field(default="", repr=False)
 
     @property
     def scenario(self) -> Scenario:
@@ -322,8 +326,8 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
         seed: Seed of a URI that names none.
 
     Raises:
-        UsageError: No such scenario, key or odometry; a key twice; a part after "?" that is not pairs; a
-            value that is not a number or out of bounds; or a run through a cloud without a file.
+        UsageError: No such scenario, key, odometry or LiDAR; a key twice; a part after "?" that is not pairs;
+            a value that is not a number or out of bounds; or a run through a cloud without a file.
     """
     name, _, query = uri.removeprefix(SCHEME).partition("?")
     if name != CLOUD and name not in SCENARIOS:
@@ -338,6 +342,8 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
     odometry = values.get("odometry", scenario.odometry if scenario else "normal")
     if odometry not in (*QUALITIES, EXACT):
         raise _refusal(uri, "odometry", odometry)
+    if values.get("lidar", LIDAR_NAMES[0]) not in LIDAR_NAMES:
+        raise _refusal(uri, "lidar", values["lidar"])
     trees = values.get("trees", scenario.trees if scenario else 0)
     if scenario and scenario.placed and trees > scenario.trees:
         remedy = f"This scenario has at most {scenario.trees} trees"
@@ -352,6 +358,7 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
         drive=values.get("drive", 0),
         file=values.get("file", ""),
         truth=values.get("truth", ""),
+        lidar=values.get("lidar", ""),
     )
 
 

@@ -296,7 +296,8 @@ def _add_undergrowth(scene: SceneBuilder, plot: Plot, x: float, y: float, radius
             scene.solids.ellipsoid(owner, centre, half, yaw=yaw, free_path=free_path, reflectivity=0.4)
 
 
-LEAST_BEAMS = 30  # as many returns make a trunk of labelled scans count (`bench holdout`)
+#: As many returns make a trunk of labelled scans count (`python -m tests.benchmarks holdout`).
+LEAST_BEAMS = 30
 
 
 def truth_in_view(
@@ -313,8 +314,9 @@ def truth_in_view(
     """
     solids, met = scene.still, np.zeros(len(scene.kinds), np.int64)
     for k, (_, R, o) in enumerate(poses):
-        directions, ranges, hit = cast_beams(lidar.at_scan(k), solids, scene.terrain, R, o, k)
-        column, ring = np.nonzero((hit >= 0) & (ranges < lidar.range_max))
+        now = lidar.at_scan(k)
+        directions, ranges, hit = cast_beams(now, solids, scene.terrain, R, o, k)
+        column, ring = np.nonzero((hit >= 0) & (ranges < lidar.range_max) & now.fired())
         solid = hit[column, ring]
         on_stem = solids.kind[solid] == STEM
         column, ring, solid = column[on_stem], ring[on_stem], solid[on_stem]

@@ -123,7 +123,9 @@ class FastSlam:
         used = not state.views or (is_view and is_needed)
         slipped = trees.slipped or state.recent.slipped
         doubted = OdometryDoubt(bool(doubt), slipped)
-        doubt = doubt or slip_detection.slip_message(state.motion, slipped, trees.unsure)
+        doubt = doubt or slip_detection.slip_message(
+            state.motion, slipped, trees.unsure, registered=motion.covariance is not None
+        )
         if used:
             state, scan, weights, births = self._observed(
                 state,
@@ -272,8 +274,9 @@ class FastSlam:
         best one, in which landmarks at the same place from before and after the loop are joined.
 
         Associations with old landmarks in the present revisit (`KeyframeGraph.revisit`) were made at the
-        drifted pose. In the solution with the loop they are left out, and landmarks that the loop brings to
-        the same position are joined. The loop is taken if its solution has the larger support
+        drifted pose. They are left out while the graph is solved with the loop, landmarks that the loop
+        brings to the same position are joined, and these detections are then associated anew
+        (`KeyframeGraph.with_known`). The loop is taken if its solution has the larger support
         (`KeyframeGraph.support`).
 
         Args:
@@ -298,7 +301,7 @@ class FastSlam:
             )
         revisit, without = graph.revisit(loop.first), graph.solve()
         support = 0.0 if without is None else graph.support(revisit, without)
-        graph = graph.without(revisit)
+        whole, graph = graph, graph.without(revisit)
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance, self.path())
         solution = graph.solve(new_loop=True)
         if solution is None:
@@ -307,7 +310,11 @@ class FastSlam:
         names = same_trees(moved, graph.first_birth_after(loop.first))
         graph = replace(graph.renamed(*names), pose=solution.pose)
         solution = graph.solve()
-        if solution is None or graph.support(revisit, solution) <= support:
+        if solution is None:
+            return None
+        graph = replace(graph.with_known(whole, revisit, solution), pose=solution.pose)
+        solution = graph.solve()
+        if solution is None or whole.support(revisit, solution) <= support:
             return None
         return self._corrected(index, graph, solution, loop.covariance, names)
 

@@ -19,7 +19,7 @@ from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import wrapped
-from pipeline.types.records import ADDED, Bool, Int, Int32
+from pipeline.types.records import Bool, Int, Int32
 
 APART = 0.5  # m or rad; minimum change of x, y or yaw between two reference poses
 # Two sigma of the ratio of two variances that are each estimated from N particles, times sqrt(N): the
@@ -52,10 +52,7 @@ class FrameUncertainty:
     scan: Int = field(default_factory=lambda: np.zeros(0, np.int64))
     pose: Float = field(default_factory=lambda: np.zeros((0, 3)))
     covariance: Float = field(default_factory=lambda: np.zeros((0, 3, 3)))
-    smoothed: Bool = field(
-        default_factory=lambda: np.zeros(0, np.bool_),
-        metadata={ADDED: lambda columns: np.zeros(len(columns["serial"]), np.bool_)},
-    )
+    smoothed: Bool = field(default_factory=lambda: np.zeros(0, np.bool_))
     hidden: Float = field(default_factory=lambda: np.zeros((3, 3)))
     at: Float = field(default_factory=lambda: np.zeros(3))
 

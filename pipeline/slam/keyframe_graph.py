@@ -292,18 +292,42 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(keyframes))
 
     def support(self, revisit: Revisit, solution: Solution) -> float:
-        """Return the sum of the kernel weights (`cauchy_weight`) of the detections of a revisit in a solution
-        of the graph. Detections of landmarks that the solution does not have do not count."""
+        """Return the sum of the kernel weights (`cauchy_weight`) of all detections on the way of a revisit,
+        each with the nearest known landmark of a solution, whatever the data association took it for."""
         total = 0.0
         for keyframe, pose in zip(self.keyframes, solution.pose, strict=True):
-            known = revisit.of(keyframe) & np.isin(keyframe.birth, solution.birth)
-            l = solution.position[np.searchsorted(solution.birth, keyframe.birth[known])]  # noqa: E741
-            C = Pose2(*pose.tolist()).rotation()
-            y = (l - pose[:2]) @ C - keyframe.centre[known]
-            xx, xy, yy = keyframe.R[known].T
-            d2 = (yy * y[:, 0] ** 2 - 2.0 * xy * y[:, 0] * y[:, 1] + xx * y[:, 1] ** 2) / (xx * yy - xy**2)
-            total += float(cauchy_weight(d2).sum())
+            _, position = _nearest_known(revisit, keyframe, pose, solution)
+            if len(position):
+                C = Pose2(*pose.tolist()).rotation()
+                y = (position - pose[:2]) @ C - keyframe.centre
+                xx, xy, yy = keyframe.R.T
+                d2 = (yy * y[:, 0] ** 2 - 2.0 * xy * y[:, 0] * y[:, 1] + xx * y[:, 1] ** 2) / (
+                    xx * yy - xy**2
+                )
+                total += float(cauchy_weight(d2).sum())
         return total
+
+    def with_known(self, whole: KeyframeGraph, revisit: Revisit, solution: Solution) -> KeyframeGraph:
+        """Return the graph with the detections of a revisit that it does not have, but `whole` (the same
+        keyframes) has: each as the nearest known landmark in a solution within TWICE, unless the keyframe has
+        this landmark already. Other ones are left out."""
+        keyframes = list(self.keyframes)
+        for n, (mine, full) in enumerate(zip(self.keyframes, whole.keyframes, strict=True)):
+            left = np.flatnonzero(revisit.of(full))
+            birth, position = _nearest_known(revisit, full, solution.pose[n], solution)
+            if not len(left) or not len(birth):
+                continue
+            away = np.hypot(*(position - _in_map(full.centre, solution.pose[n])).T)
+            near = left[(away[left] < TWICE) & ~np.isin(birth[left], mine.birth)]
+            near = near[np.argsort(away[near], kind="stable")]  # the nearest detection of a landmark is first
+            near = near[np.unique(birth[near], return_index=True)[1]]
+            keyframes[n] = replace(
+                mine,
+                birth=np.concatenate([mine.birth, birth[near]]),
+                centre=np.concatenate([mine.centre, full.centre[near]]),
+                R=np.concatenate([mine.R, full.R[near]]),
+            )
+        return replace(self, keyframes=tuple(keyframes))
 
     def thinned(self) -> KeyframeGraph:
         """Return the graph without every second keyframe, and without every second loop of more than
@@ -377,6 +401,26 @@ class KeyframeGraph:
         old = keyframe.birth[keyframe.birth < first_birth]
         seen = np.concatenate(recent) if recent else old[:0]
         return int(np.count_nonzero(~np.isin(old, seen))) >= 2
+
+
+def _in_map(centre: Float, pose: Float) -> Float:
+    """Return detections in the frame of the base, shape (D, 2) [m], in the map at a pose, shape (3,)."""
+    return pose[:2] + centre @ Pose2(*pose.tolist()).rotation().T
+
+
+def _nearest_known(
+    revisit: Revisit, keyframe: Keyframe, pose: Float, solution: Solution
+) -> tuple[Int, Float]:
+    """Return the nearest known landmark of each detection of a keyframe at a pose, shape (3,): birth numbers,
+    shape (D,), and positions in a solution, shape (D, 2) [m]; both empty outside of the revisit and without
+    known landmarks."""
+    known = solution.birth < revisit.first_birth
+    if keyframe.distance < revisit.begin or not known.any() or not len(keyframe.birth):
+        return np.zeros(0, np.int64), np.zeros((0, 2))
+    place = solution.position[known]
+    away = _in_map(keyframe.centre, pose)[:, None] - place[None]
+    nearest = np.argmin(np.einsum("dlk,dlk->dl", away, away), axis=1)
+    return solution.birth[known][nearest], place[nearest]
 
 
 JUMP, JUMP_TURN = 1.0, 1.0  # m, rad; a larger difference between path and odometry is no motion

@@ -30,7 +30,7 @@ from pipeline.slam.motion import (
     compounded,
     correct_by_pose,
     inverted,
-    step_variances,
+    step_covariance,
 )
 from pipeline.types.records import SHARED, SOURCES, Int, PoseMeasurement
 
@@ -290,8 +290,8 @@ def within_gate(T_map_base: Pose2, covariance: Float, motion: Motion, noise: Noi
     The gate is a squared Mahalanobis distance.
 
     y is the difference to the predicted pose, P the covariance of the prediction with noise and slack of the
-    motion (its `turn_sigma`, if known, replaces the noise of the heading), and R that of the measurement,
-    shared errors included. Without a measured pose, or with an infinite gate, the result is True.
+    motion (see `step_covariance`), and R that of the measurement, shared errors included. Without a measured
+    pose, or with an infinite gate, the result is True.
 
     Args:
         T_map_base: Pose before the motion.
@@ -302,11 +302,8 @@ def within_gate(T_map_base: Pose2, covariance: Float, motion: Motion, noise: Noi
     z = motion.measured
     if z is None or math.isinf(z.gate):
         return True
-    position, heading = step_variances(motion.step.x, motion.step.y, motion.step.yaw, noise)
-    if motion.turn_sigma is not None:
-        heading = motion.turn_sigma**2
     slack, slack_yaw = motion.slack
-    Q = np.diag([position + slack**2, position + slack**2, heading + slack_yaw**2])
+    Q = step_covariance(motion, noise) + np.diag([slack**2, slack**2, slack_yaw**2])
     expected, P = compound(T_map_base.as_array(), covariance, motion.step, Q)
     y = z.T_map_base.as_array() - expected
     y[2] = wrap_angle(y[2])

@@ -152,6 +152,8 @@ class Motion(NamedTuple):
             Those of successive steps are of one velocity, so they add up linearly; see `advanced`.
         doubt: Message with the reason of the doubt; empty if there is none.
         measured: Pose that another source measured at this scan, if any.
+        covariance: Covariance of the step, shape (3, 3), if its source knows it, as LiDAR odometry does;
+            None for the noise of the parameters.
         turn_sigma: Standard deviation of the yaw of the step [rad] if a gyroscope measured it, else None.
         due: Whether the scan updates the filter even if the robot has moved less than `update_distance`.
         is_view: See Step.
@@ -162,6 +164,7 @@ class Motion(NamedTuple):
     slack: tuple[float, float] = (0.0, 0.0)
     doubt: str = ""
     measured: PoseMeasurement | None = None
+    covariance: Float | None = None
     turn_sigma: float | None = None
     due: bool = False
     is_view: bool = True
@@ -173,7 +176,6 @@ DISTRUST = (1.0, 0.3)
 # m, rad; largest sum of the slack: stems that are farther from where they are expected are searched for by
 # their constellation.
 SLACK_MAX = (3.0, 0.5)
-UNKNOWN = -1.0  # replaces an absent sigma in compiled code
 # m/rad; distance to which a turn is equivalent, because a turn on the spot also changes the view of the
 # trees.
 TURN_AS_DISTANCE = 1.0
@@ -201,15 +203,28 @@ def accumulated(
     """
     step = motion.step
     news = motion.measured is not None
-    turn_sigma = UNKNOWN if motion.turn_sigma is None else motion.turn_sigma
     own = np.array(motion.slack) + distrust * motion.period * np.array(DISTRUST)
     if motion.turn_sigma is not None:
         own[1] = motion.slack[1]  # slipping wheels do not affect a gyroscope
     moved, motion_after, spread, slack_after, driven = advanced(
-        before, covariance, slack, step.x, step.y, step.yaw, own, turn_sigma, news, noise_of(p),
-        p.update_distance,
+        before, covariance, slack, step.x, step.y, step.yaw, own, step_covariance(motion, noise_of(p)),
+        news, p.update_distance,
     )  # fmt: skip
     return (motion_after, spread, slack_after, driven) if moved else None
+
+
+def step_covariance(motion: Motion, noise: Noise) -> Float:
+    """Return the covariance of the step of a motion without its slack, shape (3, 3): its own if it is known,
+    else by the noise of the odometry (`step_variances`); a gyroscope replaces the part of the heading."""
+    if motion.covariance is None:
+        position, heading = step_variances(motion.step.x, motion.step.y, motion.step.yaw, noise)
+        covariance = np.diag([position, position, heading])
+    else:
+        covariance = motion.covariance.copy()
+    if motion.turn_sigma is not None:
+        covariance[2, :] = covariance[:, 2] = 0.0
+        covariance[2, 2] = motion.turn_sigma**2
+    return covariance
 
 
 @compiled
@@ -221,9 +236,8 @@ def advanced(
     y: float,
     yaw: float,
     own: Float,
-    turn_sigma: float,
+    noise: Float,
     news: bool,
-    noise: Noise,
     update_distance: float,
 ) -> tuple[bool, Float, Float, Float, float]:
     """Return the same as `accumulated` in compiled code, with a flag in place of None.
@@ -235,9 +249,8 @@ def advanced(
         before, covariance, slack: See `accumulated`.
         x, y, yaw: Step [m, m, rad].
         own: Slack of the step itself [m, rad], shape (2,).
-        turn_sigma: See Motion [rad]; UNKNOWN for None.
+        noise: Covariance of the step without slack, shape (3, 3).
         news: Whether another source measured the pose.
-        noise: Noise of the odometry.
         update_distance: Distance after which a scan is used [m]; a doubtful step or a measured pose counts at
             least this much, so that its scan is used.
 
@@ -248,35 +261,14 @@ def advanced(
     news = news or own[0] != 0.0 or own[1] != 0.0
     if x == 0.0 and y == 0.0 and yaw == 0.0 and not news:
         return False, before.copy(), covariance.copy(), slack.copy(), 0.0
-    position, heading = step_variances(x, y, yaw, noise)
-    if turn_sigma >= 0.0:
-        heading = turn_sigma * turn_sigma
     total = np.array([min(slack[0] + own[0], SLACK_MAX[0]), min(slack[1] + own[1], SLACK_MAX[1])])
-    position += total[0] * total[0] - slack[0] * slack[0]
-    heading += total[1] * total[1] - slack[1] * slack[1]
-    moved, spread = stepped(before, covariance, x, y, yaw, position, heading)
+    spread = noise.copy()
+    for i in range(3):
+        k = i // 2
+        spread[i, i] += total[k] * total[k] - slack[k] * slack[k]
+    moved, spread = compounded(before, covariance, x, y, yaw, spread)
     driven = np.hypot(x, y) + TURN_AS_DISTANCE * abs(wrapped(yaw))
     return True, moved, spread, total, max(driven, update_distance) if news else driven
-
-
-@compiled
-def stepped(
-    motion: Float, covariance: Float, x: float, y: float, yaw: float, position: float, heading: float
-) -> tuple[Float, Float]:
-    """Return the composition of a motion and a step with independent errors, and its covariance; see
-    `compound`.
-
-    Args:
-        motion: x, y [m], yaw [rad], shape (3,).
-        covariance: Covariance of the motion, shape (3, 3).
-        x, y, yaw: Step in the frame in which the motion ends [m, m, rad].
-        position: Variance of x and of y of the step [m^2].
-        heading: Variance of the yaw of the step [rad^2].
-    """
-    noise = np.zeros((3, 3))
-    noise[0, 0] = noise[1, 1] = position
-    noise[2, 2] = heading
-    return compounded(motion, covariance, x, y, yaw, noise)
 
 
 @compiled

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.geometry.hash_grid import Cells, holds_unseen
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.types.records import Bool, Float32, Int, Int32
 
 ROOM = 16  # landmarks per block; landmarks with successive births are near each other
@@ -155,7 +155,7 @@ def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
     return grown
 
 
-@compiled_within
+@compiled_borrowing
 def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
     """Copy landmarks and bounding box of row b of the pool to row n of the pool of `other`, which may be the
     same; `owners` and `free` are not changed."""
@@ -316,14 +316,14 @@ def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: I
     return shared
 
 
-@compiled_within
+@compiled_borrowing
 def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
     """Extend the bounding box of row b of the pool by another box. In place."""
     maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x_min), min(maps.box[b, 1], y_min)
     maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x_max), max(maps.box[b, 3], y_max)
 
 
-@compiled_within
+@compiled_borrowing
 def own_block(maps: Maps, p: int, k: int) -> int:
     """Return the row of the pool of block k of particle p for writing. A shared or unused block gets a free
     row first. The pool must have a free row. The maps change in place; the content of a shared block is
@@ -380,7 +380,7 @@ def take_ancestors(ancestors: Int, pose: Float, maps: Maps) -> None:
 VARIANCE_MIN = 1e-4  # m^2 in each direction; all views of a trunk share an error of about one centimetre
 
 
-@compiled_within
+@compiled_borrowing
 def kalman_update(
     m: Float, Sigma: Float, j: int, z0: float, z1: float, R0: float, R1: float, R2: float
 ) -> None:
@@ -410,7 +410,7 @@ def kalman_update(
     Sigma[j, 0], Sigma[j, 1], Sigma[j, 2] = xx + lacking, xy, yy + lacking
 
 
-@compiled_within
+@compiled_borrowing
 def merge_duplicates(
     mean: Float,
     covariance: Float,

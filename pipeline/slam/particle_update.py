@@ -12,7 +12,7 @@ from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.gaussian import draw, rotated
 from pipeline.geometry.hash_grid import Cells, cells_for, clear, fill, per_metre
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.slam.measured_pose import MeasuredPose, correct_by_measured, update_shared_errors
 from pipeline.slam.motion import OdometryTrust, moved_pose, moved_poses, weighted_pose
 from pipeline.slam.particle_ancestry import normalised
@@ -232,7 +232,7 @@ def observe(
         _write_back(maps, p, near, all_near)
 
 
-@compiled_within
+@compiled_borrowing
 def _gather(
     maps: Maps,
     p: int,
@@ -290,7 +290,7 @@ def _gather(
     return n, free
 
 
-@compiled_within
+@compiled_borrowing
 def _learn(
     pose: Float,
     p: int,
@@ -367,7 +367,7 @@ def _farthest_missed(clear_range: Float, view_range: float) -> float:
     return min(free * free, view_range * view_range)
 
 
-@compiled_within
+@compiled_borrowing
 def _miss(
     pose: Float,
     p: int,
@@ -418,7 +418,7 @@ def _miss(
     return missed
 
 
-@compiled_within
+@compiled_borrowing
 def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
     """Write the changed rows of `near` to the map of particle p, in place; the place of a landmark whose
     score is not positive becomes unused (hits 0).
@@ -457,7 +457,7 @@ def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
         widen(maps, b, x_min, y_min, x_max, y_max)
 
 
-@compiled_within
+@compiled_borrowing
 def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
     """Write C covariance C^T into P, where C is the rotation about z by the angle with cosine c and sine s;
     both matrices have the shape (3, 3), order x, y, yaw, and must be different arrays."""
@@ -470,7 +470,7 @@ def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
     P[2, 2] = covariance[2, 2]
 
 
-@compiled_within
+@compiled_borrowing
 def _shift(
     x: float, y: float, yaw: float, c: float, s: float, motion: Float, mu: Float, statistics: Float, p: int
 ) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.geometry.gaussian import Pose, expected_spread
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.types.records import Bool, Int
 
 #: m of path without a view of a place, after which a view of it is a revisit.
@@ -162,7 +162,7 @@ class PlaceStates(NamedTuple):
     state: Int
 
 
-@compiled_within
+@compiled_borrowing
 def state_of(birth: int, places: PlaceStates) -> int:
     """Return the state of the place of a landmark by its birth number; ACTIVE for landmarks that precede all
     places, and with an empty table."""

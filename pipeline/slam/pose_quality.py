@@ -414,7 +414,7 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
     if recent.mapped and recent.found < FOUND_WEAK:
         return "weak", "most of the known trees are not found where they should be visible"
     if recent.odometry > ODOMETRY_WEAK:
-        return "weak", "the trees contradict the odometry: wheel slip or a jump"
+        return "weak", "the trees contradict the odometry"
     if recent.innovation > INNOVATION_WEAK:
         return "weak", "the trees deviate from their map positions by more than their covariances allow"
     if recent.ambiguous > AMBIGUOUS_WEAK:

@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.geometry.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
 from pipeline.geometry.hash_grid import Cells, cell_of, first_of_four
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.slam.joint_association import CHOICES, MOST, JointSearch, choose_jointly, search_for
 from pipeline.slam.pose_quality import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
 from pipeline.types.records import Bool, Int, Int32
@@ -76,7 +76,7 @@ def room_for(detections: int, landmarks: int) -> Room:
     )
 
 
-@compiled_within
+@compiled_borrowing
 def likely_pairs(
     pose: Pose,
     c: float,
@@ -141,7 +141,7 @@ def likely_pairs(
     return pairs
 
 
-@compiled_within
+@compiled_borrowing
 def find_ambiguous(pairs: int, found: int, room: Room) -> int:
     """Mark the ambiguous detections and reset `taken` of all landmarks of the pairs; return the number of
     ambiguous detections.
@@ -202,7 +202,7 @@ def fill_levels(pairs: int, room: Room) -> int:
     return n
 
 
-@compiled_within
+@compiled_borrowing
 def _sort(cost: Float, order: Int, n: int) -> None:
     """Sort the first n rows of `order` by cost, then by row (Shell sort, in place). Up to FEW rows, which are
     nearly sorted after the first particle, are sorted by its last pass."""
@@ -221,7 +221,7 @@ def _sort(cost: Float, order: Int, n: int) -> None:
         gap //= 2
 
 
-@compiled_within
+@compiled_borrowing
 def _sort_sequence(room: Room, pairs: int, found: int) -> None:
     """Write the detections in the order of their best pairs, then those without a pair, into `room.sequence`.
     `landmark_of` must be -1 for all detections, and is so afterwards."""
@@ -239,7 +239,7 @@ def _sort_sequence(room: Room, pairs: int, found: int) -> None:
         room.landmark_of[d] = -1
 
 
-@compiled_within
+@compiled_borrowing
 def recognise(
     mu: Float,
     P: Float,
@@ -339,7 +339,7 @@ def recognise(
     return float(log_likelihood) - cost
 
 
-@compiled_within
+@compiled_borrowing
 def _cost_of_new(
     pose: Pose,
     centre: Float,

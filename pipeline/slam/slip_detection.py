@@ -31,7 +31,11 @@ WIDE = 0.5  # m; sigma of a motion from which detections are associated with wro
 STOOD = (0.005, 0.002)  # m, rad; an odometry that moves less between two scans reports standstill
 STUCK = "the odometry reports standstill, but the trees move: it is stuck, and the trees determine the motion"
 UNSURE = "a few known trees move against the odometry: it is wrong, or they are people; it is used"
-SLIPPED = "the trees contradict the odometry (wheel slip or a jump): the trees determine the motion"
+SLIPPED = "the trees contradict the odometry (slip, drift or a jump): the trees determine the motion"
+MISREGISTERED = (
+    "the trees contradict the LiDAR odometry (drift, or something that moves with the robot): the trees "
+    "determine the motion"
+)
 
 
 class TreeMotion(NamedTuple):
@@ -51,14 +55,18 @@ class TreeMotion(NamedTuple):
     unsure: bool
 
 
-def slip_message(motion: Float, corrected: bool, unsure: bool) -> str:
-    """Return the message why the odometry is doubted: STUCK, SLIPPED or UNSURE; empty if there is no doubt.
+def slip_message(motion: Float, corrected: bool, unsure: bool, registered: bool = False) -> str:
+    """Return the message why the odometry is doubted: MISREGISTERED for LiDAR odometry, STUCK, SLIPPED or
+    UNSURE; empty if there is no doubt.
 
     Args:
         motion: Motion by the odometry since the last used scan, shape (3,).
         corrected: Whether trees contradicted the odometry in this scan or in one of the last scans.
         unsure: See TreeMotion.
+        registered: Whether the motion is that of LiDAR odometry.
     """
+    if corrected and registered:
+        return MISREGISTERED
     stood = np.hypot(motion[0], motion[1]) < STOOD[0] and abs(motion[2]) < STOOD[1]
     if corrected:
         return STUCK if stood else SLIPPED

@@ -14,7 +14,7 @@ from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy, normalised
 from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.places import Places
 from pipeline.slam.pose_quality import RunningStatistics
-from pipeline.types.records import ADDED, NOT_SAVED
+from pipeline.types.records import NOT_SAVED
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class SlamState:
         views: Number of scans whose detections were used.
         best: Row of the best particle, whose map is reported.
         genealogy: Ancestors of the particles and their paths.
-        path: Estimated pose of each scan. States of an earlier version have the path of the best particle.
+        path: Estimated pose of each scan.
         recent: Running statistics, from which the quality of the pose is derived.
         frame: Lower bound of the pose covariance in the frame of the map.
         graph: Graph of keyframes and landmarks.
@@ -52,24 +52,21 @@ class SlamState:
     maps: Maps
     motion: Float
     motion_covariance: Float
-    slack: Float = field(default_factory=lambda: np.zeros(2), metadata={ADDED: None})
+    slack: Float = field(default_factory=lambda: np.zeros(2))
     since_update: float = 0.0
     detections: int = 0
-    views: int = field(default=0, metadata={ADDED: None})
+    views: int = 0
     best: int = 0
     genealogy: Genealogy = field(default_factory=Genealogy)
-    path: EstimatedPath = field(
-        default_factory=EstimatedPath,
-        metadata={ADDED: lambda parts: EstimatedPath.of(parts["genealogy"].path(parts["best"]))},
-    )
+    path: EstimatedPath = field(default_factory=EstimatedPath)
     recent: RunningStatistics = field(default_factory=RunningStatistics)
     frame: FrameUncertainty = field(default_factory=FrameUncertainty)
-    graph: KeyframeGraph = field(default_factory=KeyframeGraph, metadata={ADDED: None})
-    keyframe_motion: Float = field(default_factory=lambda: np.zeros(3), metadata={ADDED: None})
-    keyframe_covariance: Float = field(default_factory=lambda: np.zeros((3, 3)), metadata={ADDED: None})
-    distance: float = field(default=0.0, metadata={ADDED: None})
-    since_keyframe: tuple[ScanDetections, ...] = field(default=(), metadata={ADDED: None})
-    places: Places = field(default_factory=Places, metadata={ADDED: None})
+    graph: KeyframeGraph = field(default_factory=KeyframeGraph)
+    keyframe_motion: Float = field(default_factory=lambda: np.zeros(3))
+    keyframe_covariance: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    distance: float = 0.0
+    since_keyframe: tuple[ScanDetections, ...] = ()
+    places: Places = field(default_factory=Places)
     shared: SharedErrors = field(default_factory=SharedErrors, metadata={NOT_SAVED: True})
 
     @classmethod

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.detection.free_space import directions
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.types.records import Bool, Float32, Int, Path
 
@@ -186,6 +185,8 @@ class SeenRecorder:
         Args:
             path: Final path; recorded scans whose stamps it does not have are left out.
         """
+        from pipeline.detection.free_space import directions  # the web process starts without Numba
+
         cells: list[Int] = []
         distance: list[Float] = []
         half = math.ceil(RANGE / CELL) + 1

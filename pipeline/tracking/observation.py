@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.detection.cylinder_fit import BEAM
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.tracking.track_table import Rows
 from pipeline.types.records import Bool, Int, Verdict
 
@@ -21,9 +22,12 @@ TAPER = 0.005  # radius per metre of height; stems of pine and spruce taper by 0
 # (docs/trunks.md), in others not at all. Half of the larger value has the same error for both.
 BUTT = 0.01
 HALF = 0.5  # m; distance from breast height at which a radius has half the weight, since the taper varies
-# Errors of a radius that more scans do not reduce, in m: the edges of a trunk are known to a fifth of half a
-# beam's width; bark is uneven.
-EDGE, UNEVEN = 0.0003, 0.0005
+# Errors of a radius that more scans do not reduce: each edge of a trunk is known to a fifth of half the width
+# of a beam, or of half the distance between returns if that is larger; bark is uneven [m].
+EDGE, UNEVEN = 0.2, 0.0005
+#: Least diameter of a trunk, in distances between returns: a sampled shape is resolved from two samples on
+#: (Nyquist). What returns measure of thinner trunks depends on the prior and on the undergrowth.
+RESOLVED = 2.0
 NEAREST = 1.0  # m; the weight of a radius is limited to that at this distance
 
 
@@ -38,6 +42,7 @@ def add_observations(
     radius_sigma: Float,
     arc: Float,
     above_breast: Float,
+    spacing: float,
 ) -> None:
     """Add the detections of one scan to the columns of their tracks, in place: hits, sums of eccentricities
     and radii, and observed sides. NaN in eccentricity or radius adds nothing to its sum.
@@ -57,6 +62,7 @@ def add_observations(
             view can show, see `widest_view`.
         above_breast: Height of the radius above breast height, shape (D,) [m]; NaN where the ground is
             unknown, which counts as HALF with the radius unchanged.
+        spacing: Angle between neighbouring returns of the sensor [rad].
     """
     for d in range(rows.shape[0]):
         t = rows[d]
@@ -76,6 +82,7 @@ def add_observations(
             tracks.radius[t] += weight * (radius[d] + lost)
             tracks.radius_weight[t] += weight
             tracks.radius_reach[t] += weight * reach
+            tracks.radius_spacing[t] += weight * spacing * reach
             tracks.radius_above[t] += weight * (abs(above) if is_known else HALF)
             tracks.radii[t] += 1
         # A view without a fitted circle takes the radius of the other views.
@@ -84,7 +91,7 @@ def add_observations(
         tracks.sides[t] |= seen_sides(np.arctan2(dy, dx), min(arc[d], widest))
 
 
-@compiled_within
+@compiled_borrowing
 def widest_view(radius: float, distance: float) -> float:
     """Return the largest part of a round stem that one view can show, 2 arccos(r / d) [rad].
 
@@ -176,7 +183,7 @@ def sides_of(bits: int) -> int:
     return seen
 
 
-@compiled_within
+@compiled_borrowing
 def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) -> bool:
     """Return whether a track is a tree: by the class of its voxel column if it has one, else by its hits.
 
@@ -191,17 +198,19 @@ def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) ->
     return bool(hits >= limits.hits_to_confirm and score > 0.0)
 
 
-@compiled_within
+@compiled_borrowing
 def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tuple[float, float]:
     """Return DBH [m] and its standard deviation [m] of the tree in row t; both NaN with fewer than
-    DBH_OBSERVATIONS radii or an observed arc below `limits.dbh_arc_min`.
+    DBH_OBSERVATIONS radii, an observed arc below `limits.dbh_arc_min`, or a diameter below RESOLVED distances
+    between returns at the mean distance of the views.
 
     For a diameter D of n views at distances r, with a mean distance |h| from breast height:
 
-    sigma^2 = 4 (sigma_views^2 / n + (EDGE r + UNEVEN)^2) + (out_of_round D)^2 + (taper_sigma |h|)^2
+    sigma^2 = 4 (sigma_views^2 / n + (EDGE b + UNEVEN)^2) + (out_of_round D)^2 + (taper_sigma |h|)^2
 
-    The last three terms do not shrink with n: all views share the edges, the shape and the foot of the tree.
-    The weights by height also widen sigma_views, so that the sigma is conservative.
+    where b is the larger of BEAM r and half the distance between returns. The last three terms do not shrink
+    with n: all views share the edges, the shape and the foot of the tree. The weights by height also widen
+    sigma_views, so that the sigma is conservative.
 
     Args:
         tracks: The tracks.
@@ -214,6 +223,10 @@ def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tup
     weight = tracks.radius_weight[t]
     reach, above = tracks.radius_reach[t] / weight, tracks.radius_above[t] / weight
     dbh = 2.0 * tracks.radius[t] / weight
-    views = 1.0 / (weight * reach * reach) + (EDGE * reach + UNEVEN) ** 2
+    spacing = tracks.radius_spacing[t] / weight
+    if dbh < RESOLVED * spacing:
+        return np.nan, np.nan
+    edge = EDGE * max(BEAM * reach, 0.5 * spacing)
+    views = 1.0 / (weight * reach * reach) + (edge + UNEVEN) ** 2
     stem = (limits.out_of_round * dbh) ** 2 + (limits.taper_sigma * above) ** 2
     return dbh, np.sqrt(4.0 * views + stem)

@@ -15,7 +15,7 @@ from pipeline.geometry.hash_grid import (
     put_in,
 )
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.tracking.observation import SECTORS, sides_of
 from pipeline.tracking.track_table import Rows, ScanPose
 from pipeline.types.records import AT_ROUND, CLASSES, RING_FAR, Bool, Columns, Int, Int32, Verdict
@@ -112,7 +112,7 @@ def confirm_round(
                 c = cells.following[c]
 
 
-@compiled_within
+@compiled_borrowing
 def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
     """Return whether a column becomes a tree because its track is round: tree has at least as many votes as
     pole and person, and at least `tree_share` of the votes weighted by AT_ROUND.
@@ -229,7 +229,7 @@ def classify_new(tracks: Rows, axis: Float, verdict: Int32) -> None:
             tracks.verdict[t] = OTHER if found == TREE else found  # another track has the tree of this column
 
 
-@compiled_within
+@compiled_borrowing
 def _is_due(tracks: Rows, t: int, scan: ScanPose, reach: float) -> bool:
     """Return whether a tree at the position of track t would have a column by now: it is within `reach` [m]
     of the robot, and DUE_NS have passed since its first observation."""
@@ -237,7 +237,7 @@ def _is_due(tracks: Rows, t: int, scan: ScanPose, reach: float) -> bool:
     return bool(dx * dx + dy * dy < reach * reach and scan.stamp_ns - tracks.first_ns[t] >= DUE_NS)
 
 
-@compiled_within
+@compiled_borrowing
 def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
     """Return whether a track has been unobserved for longer than it was observed, like a person who walked
     on.
@@ -295,7 +295,7 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     return found
 
 
-@compiled_within
+@compiled_borrowing
 def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
     """Return the row of the track with most detections within RING_FAR of an axis that may be a stem
     (`_may_be_stem`), the lowest row of equal ones; -1 for none.
@@ -327,7 +327,7 @@ def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: f
     return int(best)
 
 
-@compiled_within
+@compiled_borrowing
 def _may_be_stem(verdict: int) -> bool:
     """Return whether a track of a class can be the stem of a tree column near it: without class (negative),
     tree, or a class by votes with AT_ROUND below 1. Classes that are not by votes (moving, too few voxels)
@@ -340,7 +340,7 @@ def _may_be_stem(verdict: int) -> bool:
     return False
 
 
-@compiled_within
+@compiled_borrowing
 def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
     """Return the row of the track with the highest likelihood within REACH of an axis that is not in `taken`;
     -1 for none.

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import ADDED, Bool, Int, Verdict
+from pipeline.types.records import Bool, Int, Verdict
 
 NO_LANDMARK = -1
 
@@ -29,12 +29,6 @@ class ScanPose(NamedTuple):
     pose: Float
     covariance: Float
     relative: Float
-
-
-def _no_landmarks(columns: dict[str, Int]) -> Int:
-    """Return the landmarks of a table that an earlier version saved without them: -1. The next scan assigns
-    the nearest ones."""
-    return np.full(len(columns["number"]), NO_LANDMARK)
 
 
 @dataclass(slots=True, eq=False)
@@ -57,6 +51,7 @@ class TrackTable:
         radius: Sum of weights times radii [1/m^3].
         radius_weight: Sum of weights (see `add_observations`) [1/m^4].
         radius_reach: Sum of weights times distances of the sensor [1/m^3].
+        radius_spacing: Sum of weights times distances between neighbouring returns [1/m^3].
         radius_above: Sum of weights times distances from breast height [1/m^3].
         radii: Number of summed radii, int64.
         sides: Observed sectors, int64; bit k is set when sector k around the trunk was observed.
@@ -64,7 +59,7 @@ class TrackTable:
     """
 
     number: Int
-    landmark: Int = field(metadata={ADDED: _no_landmarks})
+    landmark: Int
     x: Float
     P: Float
     shared: Float
@@ -77,6 +72,7 @@ class TrackTable:
     radius: Float
     radius_weight: Float
     radius_reach: Float
+    radius_spacing: Float
     radius_above: Float
     radii: Int
     sides: Int
@@ -101,6 +97,7 @@ class TrackTable:
             radius=floats.copy(),
             radius_weight=floats.copy(),
             radius_reach=floats.copy(),
+            radius_spacing=floats.copy(),
             radius_above=floats.copy(),
             radii=ints.copy(),
             sides=ints.copy(),
@@ -178,6 +175,7 @@ class Rows(NamedTuple):
     radius: Float
     radius_weight: Float
     radius_reach: Float
+    radius_spacing: Float
     radius_above: Float
     radii: Int
     sides: Int
@@ -212,7 +210,14 @@ def join(rows: Rows, old: int, young: int) -> None:
         rows.landmark[old] = rows.landmark[young]
         x[old], P[old], shared[old], stamp_ns[old] = x[young], P[young], shared[young], stamp_ns[young]
     rows.score[old] = max(rows.score[old], rows.score[young])
-    for total in (rows.eccentricity, rows.radius, rows.radius_weight, rows.radius_reach, rows.radius_above):
+    for total in (
+        rows.eccentricity,
+        rows.radius,
+        rows.radius_weight,
+        rows.radius_reach,
+        rows.radius_spacing,
+        rows.radius_above,
+    ):
         total[old] += total[young]
     for number in (rows.eccentricities, rows.radii):
         number[old] += number[young]

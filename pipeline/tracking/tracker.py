@@ -40,9 +40,15 @@ class Tracker:
         tracks: State of each tree; the next scan changes it in place.
     """
 
-    def __init__(self, parameters: Tracking) -> None:
-        """Create a tracker without trees; the first tree gets the number 1."""
+    def __init__(self, parameters: Tracking, spacing: float = 0.0) -> None:
+        """Create a tracker without trees; the first tree gets the number 1.
+
+        Args:
+            parameters: Parameters of the stage.
+            spacing: Angle between neighbouring returns [rad]; 0 for a sensor that resolves all trunks.
+        """
         self.parameters = parameters
+        self._spacing = spacing
         self.next_number = 1
         self.tracks = TrackTable.empty()
         nothing = np.zeros((3, 3))
@@ -102,7 +108,7 @@ class Tracker:
         above = np.full(len(row), np.nan) if heights is None else heights - p.breast_height
         add_observations(
             self.tracks.as_rows(), row[known], position[known], scan.pose, d.eccentricity[known],
-            d.radius[known], d.radius_sigma[known], d.arc[known], above[known],
+            d.radius[known], d.radius_sigma[known], d.arc[known], above[known], self._spacing,
         )  # fmt: skip
         kept = merge_near(self.tracks.as_rows(), rows, p.proximity_radius)
         if not kept.all():

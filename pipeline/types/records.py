@@ -18,9 +18,6 @@ from pipeline.geometry.poses import Pose2, Pose3
 
 # Metadata of fields of records that are written to files, see `pipeline.io.checkpoints`.
 NOT_SAVED = "not saved"  # of a field that is not saved and gets its default
-# Of a field that files of an earlier version lack: a function of the other fields that
-# returns its value, or None for its default.
-ADDED = "added"
 
 Float32 = NDArray[np.float32]
 Int = NDArray[np.int64]
@@ -54,6 +51,7 @@ class Scan:
         offset_ns: int32, shape (N,), time of each point relative to `stamp_ns`, or None.
         dropped: Number of returns that the reader rejected because they were not finite or empty.
         stems: Stems, if the source provides stems instead of returns; `points` are their positions then.
+        T_base_lidar: Extrinsics of the LiDAR that made the scan, if it is not that of the source.
     """
 
     stamp_ns: int
@@ -63,6 +61,7 @@ class Scan:
     offset_ns: Int32 | None = None
     dropped: int = 0
     stems: Stems | None = None
+    T_base_lidar: Pose3 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,10 +71,14 @@ class Odometry:
     Attributes:
         stamp_ns: Time of the pose.
         T_odom_base: Pose of the base in the frame of the odometry.
+        covariance: Covariance of the step since the previous pose, x, y [m], yaw [rad] in the frame of the
+            base at that pose, shape (3, 3), as a registration of scans knows it; None of wheels, whose noise
+            is a parameter.
     """
 
     stamp_ns: int
     T_odom_base: Pose3
+    covariance: Float | None = None
 
 
 SHARED = 4  # most errors that all poses of a source share: two of a shift, two of rotations
@@ -176,8 +179,9 @@ class Sensor:
     Attributes:
         name: Displayed name, e.g. "VLP-16".
         rings: Number of lasers; 1 for a planar laser; 0 if unknown or not a spinning sensor.
-        ring_step: Angle between neighbouring lasers [rad]; 0 if unknown.
-        azimuth_step: Angle between neighbouring shots [rad].
+        ring_step: Angle between neighbouring lasers, or between neighbouring returns of a sensor without
+            rings [rad]; 0 if unknown.
+        azimuth_step: Angle between neighbouring shots, or returns of a sensor without rings [rad].
         range_sigma: Standard deviation of a range [m].
         range_max: Largest range that it reports [m].
     """
@@ -254,6 +258,7 @@ class Step:
         warnings: Messages of the synchroniser since the previous scan.
         doubt: Message why the motion to this scan may be wrong; empty if there is no doubt.
         slack: Standard deviations that the doubt adds to the motion: position [m] and heading [rad].
+        covariance: Covariance of the motion since the previous scan, see Odometry; None if unknown.
         unreported: Motion by the odometry up to the previous scan that no earlier step contains, because the
             odometry was missing; it came with this step. None without such a motion.
         measured: Pose measurement of another source at this scan, or None.
@@ -263,6 +268,8 @@ class Step:
         period_ns: Time since the previous scan [ns]; 0 for the first one.
         is_view: Whether SLAM and the tracker may use the scan. Scans in quick succession show the
             same errors of a trunk, so that more of them are no more evidence.
+        again_ns: Time since the previous scan of the same LiDAR in the same directions [ns]; None without
+            one.
     """
 
     index: int
@@ -275,6 +282,7 @@ class Step:
     warnings: tuple[str, ...] = ()
     doubt: str = ""
     slack: tuple[float, float] = (0.0, 0.0)
+    covariance: Float | None = None
     unreported: Pose2 | None = None
     measured: PoseMeasurement | None = None
     turn: Turn | None = None
@@ -282,10 +290,12 @@ class Step:
     elapsed_ns: int = 0
     period_ns: int = 0
     is_view: bool = True
+    again_ns: int | None = None
 
     def is_due(self, interval: float, delay: float = 0.0) -> bool:
         """Return whether the scan is used by something that needs one scan per interval of time, whatever the
-        rate of the sensor: the first scan of an interval, and all scans of the first second (FIRST_NS).
+        rate of the sensor: of each LiDAR and direction the first scan of an interval, and all scans of the
+        first second (FIRST_NS).
 
         Args:
             interval: Length of the intervals [s]; 0 makes each scan due.
@@ -295,7 +305,8 @@ class Step:
         if self.elapsed_ns < FIRST_NS or interval == 0.0:
             return True
         length, since = round(interval * 1e9), self.elapsed_ns - round(delay * 1e9)
-        return since // length > (since - self.period_ns) // length
+        before_ns = self.period_ns if self.again_ns is None else self.again_ns
+        return since // length > (since - before_ns) // length
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -335,6 +346,7 @@ class Verdict(IntEnum):
     AT_BORDER = 14
     MOVING = 15
     HIDDEN = 16
+    STUMP = 17
 
     @property
     def label(self) -> str:
@@ -461,6 +473,7 @@ class Columns:
         axis: shape (K, 5): x, y at 1.3 m [m], shift of x and y per metre of height, strength.
         viewed: Greatest height above the ground that a scan observed there [m].
         present, absent: Number of scans with free view of the place in which an object was there, or not.
+        absent_lately: Number of the last of these scans without a break in which no object was there.
         met, passed: int32, shape (K, slices of height): rays that ended at it, or passed its axis.
         figures: shape (K, figures): features, see `pipeline.classification.features.NAMES`.
         share: shape (K, 6): votes for tree, pole, person, bush, wall, other.
@@ -472,6 +485,7 @@ class Columns:
     viewed: Float
     present: Float
     absent: Float
+    absent_lately: Float
     met: Int32
     passed: Int32
     figures: Float
@@ -717,10 +731,15 @@ class CloudDescription:
         crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
         digest: SHA-256 (hex) of the file.
         warnings: Messages for the user.
-        low, high: Corners by the header in the coordinates of the file, shape (3,) [m]; not checked. None if
+        low, high: Corners by the header (not checked) or by a sample of the points, shape (3,) [m]. None if
             unknown.
         attributes: Names of the columns besides the coordinates.
         cut_above: Whether the field of view of a sensor cuts the trees, as in the cloud of a drive.
+        unit: Unit of the coordinates of the file and how it is known, for people.
+        up: Axis of the file that points up and how it is known, for people.
+        form: Why the file was taken as a whole cloud, for people; "" for a format of whole clouds.
+        crs_unit: Metres per unit of the reference system of the file, horizontal and vertical, in which
+            positions are written; offset, corners and points are in metres.
     """
 
     uri: str
@@ -734,6 +753,10 @@ class CloudDescription:
     high: Float | None = None
     attributes: tuple[str, ...] = ()
     cut_above: bool = False
+    unit: str = "metres"
+    up: str = "z"
+    form: str = ""
+    crs_unit: tuple[float, float] = (1.0, 1.0)
 
 
 class WholeCloud(Protocol):

@@ -80,10 +80,11 @@ async def served(scene: FakeScene | None = None) -> AsyncIterator[tuple[str, Das
 
 def routes() -> set[tuple[str, str]]:
     """Method and path of every route; websockets have the method WS."""
-    return {pair for router in ROUTERS for route in router.routes for pair in _pairs(route)}
+    return {pair for router in ROUTERS for route in router.routes for pair in pairs_of(route)}
 
 
-def _pairs(route: BaseRoute) -> Iterator[tuple[str, str]]:
+def pairs_of(route: BaseRoute) -> Iterator[tuple[str, str]]:
+    """Method and path of a route."""
     if isinstance(route, WebSocketRoute):
         yield "WS", route.path
     else:

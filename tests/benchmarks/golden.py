@@ -1,4 +1,4 @@
-"""Regression check of complete runs: `python -m tests.benchmarks.golden`.
+"""Regression check of complete runs: `python -m tests.benchmarks golden`.
 
 The script maps a fixed list of sources with the command `stemmap map` of the present environment and compares
 the SHA-256 digest of each output file with `golden.json`. `--write` stores the present digests and key

@@ -1,6 +1,7 @@
 """What annotations of simulated streets and parks change: `python -m tests.benchmarks.learned`.
 
-Every column of the scenes counts as annotated; scenes are left out as wholes, see `app.training.learning`.
+Every column of the scenes counts as annotated; scenes are left out as wholes, see
+`app.extensions.learning.learning`.
 """
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from app.training.examples import UNKNOWN, Examples
-from app.training.learning import Rates, validate
+from app.extensions.learning.examples import UNKNOWN, Examples
+from app.extensions.learning.learning import Rates, validate
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, read_forests, standard_forest
 from pipeline.config import Parameters, preset
 from pipeline.types.records import Verdict

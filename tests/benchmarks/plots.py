@@ -1,4 +1,4 @@
-"""Pictures of path, truth and map for docs/results.md: `stemmap bench NAME --pictures DIR`.
+"""Pictures of path, truth and map for docs/results.md: `python -m tests.benchmarks NAME --pictures DIR`.
 
 Everything is drawn in the frame of the map; truth and odometry are laid on the path by a rigid motion.
 """

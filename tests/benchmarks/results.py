@@ -1,6 +1,6 @@
 """Maps the runs of docs/results.md anew and puts the figures into its tables.
 
-`python -m tests.benchmarks.results [paper stands victoria recordings]`: each run is one `stemmap map` in a
+`python -m tests.benchmarks results [paper stands victoria recordings]`: each run is one `stemmap map` in a
 process of its own, and every cell is read from the run.json that it wrote.
 """
 

@@ -20,8 +20,8 @@ from tests.benchmarks.table import Table
 
 HEADING = """# Benchmarks
 
-Written by `stemmap bench`; do not edit. Both sides of a comparison are measured in turns (A B A B), each
-library at one thread, because machines are noisy: ratios hold, absolute times vary up to twofold.
+Written by `python -m tests.benchmarks`; do not edit. Both sides of a comparison are measured in turns (A B A
+B), each library at one thread, because machines are noisy: ratios hold, absolute times vary up to twofold.
 """
 
 
@@ -73,7 +73,7 @@ def run(names: Sequence[str], *, out: Path, json_file: Path | None, day: date) -
 def section(name: str, line: str, tables: Sequence[Table], machine: str, day: date) -> str:
     """The part of the Markdown file that belongs to one benchmark."""
     body = "\n\n".join(table.markdown() for table in tables)
-    return f"## {name}\n\n{line}. `stemmap bench {name}`, {day}, {machine}.\n\n{body}\n"
+    return f"## {name}\n\n{line}. `python -m tests.benchmarks {name}`, {day}, {machine}.\n\n{body}\n"
 
 
 def as_json(done: Mapping[str, Sequence[Table]], machine: str, day: date) -> str:

@@ -1,4 +1,4 @@
-"""Seeds of a benchmark: its own, or those of `stemmap bench --seeds`."""
+"""Seeds of a benchmark: its own, or those of `python -m tests.benchmarks --seeds`."""
 
 from __future__ import annotations
 

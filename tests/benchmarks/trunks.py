@@ -20,12 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from app.common.timers import Stopwatch
-from app.training.examples import SUFFIX, Examples, read_examples
+from app.extensions.learning.examples import SUFFIX, Examples, read_examples
 from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
 from pipeline.config import preset
 from pipeline.evaluation import evaluate, match
 from pipeline.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from pipeline.io.readers import open_source
+from pipeline.io.readers.base import SourceOptions
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
@@ -209,7 +210,7 @@ def tape_errors() -> tuple[list[float], int]:
     folder = DATA / "trunk_dbh"
     error, of = list[float](), 0
     for name, tape in _tape(folder / "dbh_reference.csv"):
-        with closing(open_source(str(folder / name))) as source:
+        with closing(open_source(str(folder / name), SourceOptions(form="scan"))) as source:
             points = next(r.points for r in source.records() if hasattr(r, "points")).astype(np.float64)
         of += 1
         # Merged from several views, as a whole cloud is: no ray tells which side of the trunk was seen.

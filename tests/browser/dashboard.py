@@ -194,6 +194,15 @@ class Dashboard:
         self.page.get_by_role("tab", name=name).click()
         return self.page.locator(f"#panel-{name.lower()}")
 
+    def card_shown(self) -> None:
+        """Wait until the review card shows the selected tree; until then the review takes no answer."""
+        self.until("() => document.getElementById('review').getAttribute('aria-busy') === 'false'")
+
+    def answer(self, key: str) -> None:
+        """Press a key of the review once the card shows the selected tree."""
+        self.card_shown()
+        self.page.locator("#map").press(key)
+
     def clusters(self) -> int:
         """How many clusters the standing scan has, as the tab Clusters says."""
         panel = self.tab("Clusters")

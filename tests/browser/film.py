@@ -158,6 +158,7 @@ def annotate(dashboard: Dashboard, camera: Camera) -> None:
     dashboard.tab("Annotate")
     page.locator("#annotate-next").click()
     for number in range(1, 5):  # the next tree is selected after each
+        dashboard.card_shown()
         page.locator("#annotate-yes").click()
         page.locator("#annotate-count", has_text=f"{number} of").wait_for()
         camera.roll()

@@ -79,9 +79,6 @@ def main(folder: Path, wanted: list[str]) -> None:
         with Server(STEMMAP_FOLDER=kept) as server:
             for size in SIZES:
                 survey_run(browser, server.link, folder, size, wanted)
-        with Server("sim:paper?duration=20 sim:stand?duration=20", STEMMAP_FOLDER=kept) as fleet:
-            for size in SIZES:
-                survey_fleet(browser, fleet.link, folder, size, wanted)
         browser.close()
 
 
@@ -149,19 +146,6 @@ def survey_runs(survey: Survey, link: str) -> None:
     page.locator("#runs tbody tr button").first.click()
     page.locator(".run-map canvas").wait_for()
     survey.picture("runs-detail")
-
-
-def survey_fleet(browser: Browser, link: str, folder: Path, size: str, wanted: list[str]) -> None:
-    """The page of two robots."""
-    context = browser.new_context(viewport={"width": SIZES[size][0], "height": SIZES[size][1]})
-    page = context.new_page()
-    survey = Survey(page, folder, size, wanted)
-    if survey.takes("fleet"):
-        page.goto(link)
-        page.locator(".card").nth(1).wait_for()
-        page.wait_for_timeout(4000)
-        survey.picture("fleet")
-    context.close()
 
 
 if __name__ == "__main__":

@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Position, Route, expect
 
-from pipeline.io.readers import open_source
 from tests.browser.conftest import opened, opened_by_another
-from tests.browser.dashboard import COMPILING_S, Dashboard
+from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
 
 
@@ -68,7 +67,7 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     expect(hint).to_contain_text(f"Tree {first['number']}, detected in")
     expect(hint).to_contain_text(re.compile(r"votes: tree [\d.]+ % \(40 % needed\)"))
     size = canvas.bounding_box()
-    canvas.press("y")
+    person.answer("y")
     expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} trees reviewed")
     expect(page.locator("#legend-annotation")).to_be_visible()
     assert canvas.bounding_box() == size
@@ -85,7 +84,7 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     person.drawn()
     canvas.click(position=place_of(person, near["x"], near["y"]))
     page.locator("#annotate-kind").select_option("pole")
-    canvas.press("n")
+    person.answer("n")
     expect(page.locator("#annotations tbody tr")).to_have_count(2)
     expect(page.locator("#legend-rejected")).to_be_visible()  # its tree is crossed out on the map
     assert canvas.bounding_box() == size
@@ -162,6 +161,48 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     assert person.errors == []
 
 
+ANSWERS = """async (keys) => {
+  const given = [], card = document.getElementById("review");
+  for (const key of keys) {
+    const title = document.getElementById("review-title").textContent;
+    const busy = card.getAttribute("aria-busy") !== "false";
+    const event = new KeyboardEvent("keydown", { key, bubbles: true });
+    document.getElementById("map").dispatchEvent(event);
+    given.push([key, title, busy]);
+    await new Promise((resolve) => setTimeout(resolve, 250));
+  }
+  return given;
+}"""
+
+
+def test_quick_answers_belong_to_the_tree_on_the_card(person: Dashboard):
+    page = person.page
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    expect(page.locator("#review-title")).to_be_hidden()  # else the key answers for a tree of the test before
+    page.locator("#map").press("s")
+    person.card_shown()
+    given = page.evaluate(ANSWERS, list("yynynnsyynysnyny"))
+    told: dict[int, str] = {}
+    for key, title, busy in given:
+        assert busy == title.endswith("loading …")
+        if not busy:
+            told[int(title.split()[1])] = {"y": "tree", "n": "other", "s": "skipped"}[key]
+    assert len(told) > 3
+    number = len(told)
+    person.until_server("/api/annotations", f"it.trees.length + it.skipped.length === {number}")
+    answers = person.ask("/api/annotations")
+    number_of = "import('/static/js/annotate/annotations.js').then(it => rows.map(it.treeNumberOf))"
+    every = [*answers["trees"], *answers["skipped"]]
+    of_tree = page.evaluate(f"(rows) => {number_of}", every)
+    assert {tree: row["kind"] for tree, row in zip(of_tree, every, strict=True)} == told
+    last = page.locator("#review-last")
+    expect(last).to_be_visible()
+    last.get_by_role("button").click()
+    person.until_server("/api/annotations", f"it.trees.length + it.skipped.length === {number - 1}")
+    expect(last).to_be_hidden()
+    assert person.errors == []
+
+
 def test_keys_work_after_a_click_on_next(person: Dashboard):
     page = person.page
     page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
@@ -176,8 +217,10 @@ def test_keys_work_after_a_click_on_next(person: Dashboard):
     person.eventually(lambda: bool(page.evaluate(nothing)), lambda: "a tree is selected")
     page.locator("#annotate-next").click()
     expect(hint).to_contain_text(f"Tree {first['number']}, detected in")
+    person.card_shown()
     page.keyboard.press("s")
     expect(hint).to_contain_text(f"Tree {second['number']}, detected in")
+    person.card_shown()
     page.keyboard.press("n")
     expect(page.locator("#annotations tbody tr")).to_have_count(1)
     (row,) = rows(person)
@@ -196,6 +239,7 @@ def test_skipped_trees_are_stored_come_last_and_are_listed_by_their_state(person
     for tree in (first, second):
         canvas.press("s")
         expect(hint).to_contain_text(f"Tree {tree['number']}, detected in")
+        person.card_shown()
     canvas.press("s")
     expect(page.locator("#annotate-skipped")).to_have_text("2 skipped")
     person.until_server("/api/annotations", "it.skipped.length === 2 && it.trees.length === 0")
@@ -212,7 +256,7 @@ def test_skipped_trees_are_stored_come_last_and_are_listed_by_their_state(person
     expect(mine.locator("td").first).to_have_text(f"{first['number']} ↷")
     mine.click()
     person.tab("Annotate")
-    canvas.press("y")
+    person.answer("y")
     expect(page.locator("#annotate-confirmed")).to_have_text("1 confirmed")
     expect(page.locator("#annotate-skipped")).to_have_text("1 skipped")
     row = page.locator("#annotations tbody tr")
@@ -265,7 +309,7 @@ def test_the_card_shows_the_evidence_on_the_selected_tree(person: Dashboard):
 
 def test_a_tree_that_is_selected_again_while_its_evidence_loads_is_shown(person: Dashboard):
     page = person.page
-    tree = doubted(person)[0]["number"]
+    tree = doubted(person)[3]["number"]  # not one that is loaded ahead
     select = "tree => import('/static/js/core/live_feed.js').then(({ select }) => select(tree))"
     page.evaluate(select, None)
     expect(page.locator("#review-title")).to_be_hidden()
@@ -384,59 +428,6 @@ def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
     assert person.errors == []
 
 
-def test_training_states_what_it_needs_starts_on_request_and_is_stopped(person: Dashboard):
-    page = person.page
-    learn = page.get_by_role("region", name="Learn")
-    grow = learn.get_by_role("button", name="Train decision trees")
-    expect(learn).to_contain_text("10 trees and 5 other objects")
-    expect(learn).to_contain_text("answer No (N) for a found tree")
-    expect(grow).to_be_disabled()
-    table = "".join(f"{k},50,{'tree' if k < 10 else 'pole'}\n" for k in range(15))
-    page.evaluate(IMPORTED, "x_m,y_m,class\n" + table)
-    expect(learn).to_contain_text("Annotated in 1 run: 10 trees, 5 poles.")
-    grow.click()
-    stop = learn.get_by_role("button", name="Stop")
-    expect(stop).to_be_visible()
-    expect(learn).to_contain_text("Mapping sim:stand")
-    stop.click()
-    expect(grow).to_be_enabled()
-    person.until_server("/api/learning", "it.state === 'idle' && it.learned === null")
-    person.until_server("/api/parameters", "it.values['classification.forest'] === 'package'")
-    assert person.errors == []
-
-
-@pytest.mark.slow
-def test_trained_decision_trees_are_compared_with_the_present_ones_and_used_on_request(
-    chromium: Browser, tmp_path: Path
-):
-    uri = "sim:stand?duration=4&trees=40"
-    truth = open_source(uri).truth()
-    assert truth is not None
-    assert truth.trees is not None
-    rows_of_truth = zip(truth.trees.x.tolist(), truth.trees.y.tolist(), truth.trees.kind, strict=True)
-    table = "".join(f"{x},{y},{kind}\n" for x, y, kind in rows_of_truth)
-    with Server(uri, STEMMAP_FOLDER=str(tmp_path)) as server, opened(chromium, server.link) as person:
-        person.pause()
-        person.until_server("/api/annotations", "it.run !== null")
-        person.page.evaluate(IMPORTED, "x_m,y_m,class\n" + table)
-        person.tab("Annotate")
-        learn = person.page.get_by_role("region", name="Learn")
-        learn.get_by_role("button", name="Train decision trees").click()
-        use = learn.get_by_role("button", name="Use the new ones")
-        expect(use).to_be_visible(timeout=1000 * COMPILING_S)
-        expect(learn.get_by_role("row", name=re.compile("^new"))).to_contain_text(" of ")
-        person.until_server("/api/parameters", "it.values['classification.forest'] === 'package'")
-        use.click()
-        expect(learn.locator("#learn-used")).to_contain_text(
-            re.compile(r"In use: trained 20\d\d-.* from \d+ trees, .* in 1 run")
-        )
-        name = person.ask("/api/learning")["learned"]["name"]
-        person.until_server("/api/parameters", f"it.values['classification.forest'] === '{name}'")
-        learn.get_by_role("button", name="Use the built-in ones").click()
-        person.until_server("/api/parameters", "it.values['classification.forest'] === 'package'")
-        assert person.errors == []
-
-
 @pytest.mark.slow
 def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser, tmp_path: Path):
     with Server(STEMMAP_FOLDER=str(tmp_path)) as first, opened(chromium, first.link) as person:
@@ -444,10 +435,10 @@ def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser,
         person.until_server("/api/trees", "it.trees.length > 20")
         person.tab("Annotate")
         person.page.locator("#map").press("s")
-        person.page.locator("#map").press("y")
+        person.answer("y")
         person.page.locator("#annotate-name").fill("Ann")
         person.page.locator("#annotate-name").press("Enter")
-        person.page.locator("#map").press("y")
+        person.answer("y")
         expect(person.page.locator("#annotate-count")).to_contain_text("2 of")
         before = rows(person)
         first.kill()

@@ -31,6 +31,8 @@ def dashboard(chromium: Browser, run: Path, server: Server) -> Iterator[Dashboar
         page.locator("#source-uri").fill(str(run))
         page.locator("#source-inside summary").click()
         expect(page.locator("#inside-body tr", has_text="/velodyne_points")).to_contain_text("10 Hz")
+        expect(page.locator("#inside-body .inside-detail", has_text="velodyne > base_link")).to_be_attached()
+        expect(page.locator("#inside-body .inside-detail", has_text="used as scan")).to_be_attached()
         page.locator("#inside-body input[name=z]").fill("2")
         page.locator("#source-open").click()
         expect(page.locator("#source-dialog")).to_be_hidden()

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Page, expect
 
 from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
@@ -55,6 +56,46 @@ def open_cloud(page: Dashboard, cloud: Path, drive: bool = False) -> None:
         expect(odometry).to_be_visible()
     page.page.locator("#source-open").click()
     expect(page.page.locator("#source-dialog")).to_be_hidden()
+
+
+@pytest.fixture
+def dialog(page: Dashboard) -> Iterator[Page]:
+    """The open dialog, of which nothing reaches the server."""
+    page.page.route("**/api/open", lambda route: route.fulfill(status=202, json={}))
+    page.page.locator("#source-button").click()
+    yield page.page
+    page.page.locator("#source-close").click()
+    page.page.unroute("**/api/open")
+
+
+def sent_by(page: Page) -> dict[str, Any]:
+    """Press *Open*, and return what the page asks for."""
+    with page.expect_request("**/api/open") as request:
+        page.locator("#source-open").click()
+    return dict(request.value.post_data_json or {})
+
+
+def test_what_is_chosen_for_a_file_of_points_is_sent(dialog: Page) -> None:
+    dialog.locator("#source-uri").fill("wood.ply")
+    dialog.get_by_label("Read as").select_option("scan")
+    dialog.locator("#source-unit").select_option("ft")
+    dialog.get_by_label("Up axis").select_option("-y")
+    sent = sent_by(dialog)
+    assert [sent[name] for name in ("uri", "form", "unit", "up")] == ["wood.ply", "scan", "ft", "-y"]
+
+
+def test_what_is_chosen_for_one_source_does_not_count_for_the_next(dialog: Page) -> None:
+    dialog.locator("#source-uri").fill("")
+    dialog.locator("#source-odometry").select_option("static")  # before a path, for the one to come
+    dialog.locator("#source-uri").fill("wood.ply")
+    dialog.get_by_label("Drive a simulated robot").check()
+    expect(dialog.locator("#source-odometry")).to_have_value("static")
+    dialog.get_by_label("Read as").select_option("scan")
+    dialog.locator("#source-unit").select_option("ft")
+    dialog.get_by_label("Up axis").select_option("y")
+    dialog.locator("#source-uri").fill("utm.laz")
+    expect(dialog.get_by_label("Map this cloud")).to_be_checked()
+    assert sent_by(dialog) == {"uri": "utm.laz", "odometry": "auto"}
 
 
 def test_a_cloud_is_opened_and_its_stems_have_sections_and_heights(page: Dashboard, cloud: Path) -> None:

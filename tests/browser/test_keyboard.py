@@ -55,6 +55,7 @@ def test_a_run_is_opened_tuned_annotated_and_exported(chromium: Browser, server:
             expect(chosen).to_have_count(1)
             expect(chosen).not_to_have_attribute("data-tree", number)
             number = chosen.get_attribute("data-tree") or ""
+            dashboard.card_shown()
             page.keyboard.press("y")
             dashboard.until_server("/api/annotations", f"it.trees.length === {count}")
         # Export.

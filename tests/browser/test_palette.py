@@ -11,9 +11,6 @@ from tests.browser.dashboard import Dashboard
 
 FOUND = {
     "tree_share": "Tree threshold",
-    "how much does radius eps": "Sensitivity of Radius eps",
-    "tune for me": "Tune for me",
-    "learn train": "Learn: train",
     "score against": "Score against",
     "topics": "Topics and mounting",
     "chart time": "Chart: Time per stage",

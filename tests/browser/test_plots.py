@@ -79,6 +79,10 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     form.get_by_role("button", name="Add").click()
     expect(rows).to_have_count(4)
     name = page.get_by_label("Name of plot north")
+    name.evaluate("node => { node.select(); window.selected = node; }")
+    page.get_by_label("count trees from").dispatch_event("change")  # the table is filled again
+    assert page.evaluate("document.activeElement === window.selected")
+    assert name.evaluate("node => node.selectionEnd - node.selectionStart") == len("north")
     name.fill("south")
     name.press("Enter")
     person.until_server("/api/annotations", "it.plots[3].name === 'south'")

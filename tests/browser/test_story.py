@@ -39,6 +39,30 @@ def test_the_story_of_a_selected_tree_is_updated_while_the_run_plays(dashboard: 
     expect(panel.locator(".empty")).to_contain_text("Nothing selected")
 
 
+def test_the_story_of_a_tree_that_a_person_rejected_says_so(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    page.locator("#trees tbody tr").nth(3).click()
+    story = page.locator("#panel-story")
+    expect(story.locator("[data-gathered]")).to_be_visible()
+    expect(story.locator("[data-rejected]")).to_have_count(0)
+    dashboard.tab("Annotate")
+    page.locator("#annotate-kind").select_option("pole")
+    dashboard.answer("n")
+    expect(page.locator("#annotations tbody tr")).to_have_count(1)
+    dashboard.tab("Trees")
+    page.locator("#trees tbody tr").nth(3).click()
+    expect(story.locator("[data-rejected=pole]")).to_contain_text("A person rejected this tree")
+    dashboard.reset()
+    expect(story.locator("[data-rejected]")).to_have_count(0)
+
+
+def test_a_place_that_no_scan_viewed_clearly_has_no_sentence_of_views(dashboard: Dashboard):
+    say = "async (counts) => (await import('/static/js/explain/columns.js')).clearViewText(...counts)"
+    assert dashboard.page.evaluate(say, [0, 0]) == ""
+    assert "In 0 of 1 scan with" in dashboard.page.evaluate(say, [0, 1])
+
+
 def test_the_story_of_a_cluster_remains_while_the_run_plays(dashboard: Dashboard):
     page = dashboard.page
     panel = dashboard.tab("Clusters")

@@ -8,8 +8,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from app.training.examples import POLE as POLE_CLASS
-from app.training.examples import TREE, Examples
+from app.extensions.learning.examples import POLE as POLE_CLASS
+from app.extensions.learning.examples import TREE, Examples
 from pipeline.classification.features import COUNT
 from pipeline.config import preset
 from pipeline.simulation.primitives import SolidsBuilder

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.training.examples import TREE, UNKNOWN
+from app.extensions.learning.examples import TREE, UNKNOWN
 from pipeline.config import preset
 from pipeline.simulation.lidar import CONE
 from pipeline.simulation.scene_objects import SceneBuilder, add_sign

@@ -247,7 +247,7 @@ def georeference_words(frame: MapFrame, texts: dict[str, str], number: Numbers) 
     values = {
         name: number(value, 0 if name in ("points", "fixes") else 3) for name, value in frame.numbers.items()
     }
-    words = frame.note or texts[f"by_{frame.method or 'source'}"].format(**values)
+    words = texts[f"by_{frame.method or 'source'}"].format(**values)
     sigma = f"; {texts['frame_sigma']} ± {number(frame.sigma, 3)} m" if math.isfinite(frame.sigma) else ""
     return f"{frame.title}: {words}{sigma}"
 

@@ -28,7 +28,6 @@ from starlette.status import WS_1013_TRY_AGAIN_LATER
 from app.common.settings import Settings
 from app.common.timers import RequestQueue
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.learning import Learning
 from app.sources.request import FILE, SourceRequest
 from app.store.records import Author
 from app.store.store import Store
@@ -77,7 +76,7 @@ class Limits:
         self.viewers, self.comparisons = RequestQueue(pause_s=0.5), RequestQueue()
 
 
-def _of_app(name: str) -> Any:  # noqa: ANN401 - what `Depends` returns
+def of_app(name: str) -> Any:  # noqa: ANN401 - what `Depends` returns
     """Return the dependency on an object of the application, by its name in `app.state`."""
 
     def get(connection: HTTPConnection) -> object:
@@ -86,10 +85,9 @@ def _of_app(name: str) -> Any:  # noqa: ANN401 - what `Depends` returns
     return Depends(get)
 
 
-Dash = Annotated[Dashboard, _of_app("dashboard")]
-Deployment = Annotated[Settings, _of_app("settings")]
-Bounds = Annotated[Limits, _of_app("limits")]
-Trainer = Annotated[Learning, _of_app("learning")]
+Dash = Annotated[Dashboard, of_app("dashboard")]
+Deployment = Annotated[Settings, of_app("settings")]
+Bounds = Annotated[Limits, of_app("limits")]
 
 
 def _role(connection: HTTPConnection) -> Role:
@@ -153,7 +151,7 @@ ViewerTurn = Depends(_viewer_turn, scope="function")
 # --- which files may be opened ------------------------------------------------------------------------
 
 
-_ODOMETRY = ("auto", "wheels", "kiss-icp", "static")
+_ODOMETRY = ("auto", "wheels", "lidar", "static")
 
 
 class NotPermittedError(StemmapError):

@@ -117,7 +117,9 @@ async def import_table(body: _Import, dashboard: Dash) -> Response:
     that exist already as annotations or earlier in the table (`left_out`), and the counts of edits, see
     `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows, 409 as in `add`; then
     nothing is added. Without new rows there is no edit."""
-    contents = await asyncio.to_thread(_imported, body, dashboard.offset)
+    cloud = dashboard.status.cloud
+    unit = (1.0, 1.0) if cloud is None else cloud.crs_unit
+    contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new: dict[tuple[float, float, str], Content] = {}
     for content in contents:
@@ -208,14 +210,19 @@ def _check(content: Content, row: int) -> None:
         )
 
 
-def _imported(body: _Import, offset: tuple[float, float]) -> list[Content]:
+def _imported(
+    body: _Import, offset: tuple[float, float], unit: tuple[float, float] = (1.0, 1.0)
+) -> list[Content]:
     """Return the rows of an imported table in the frame of the map; raises BadRequestError if it cannot be
-    read, or a row or their number is out of bounds.
+    read, or a row or their number is out of bounds. A table of a cloud in feet may be in feet or in metres,
+    see `truth_in_metres`.
 
     Args:
         body: The request.
-        offset: Offset of the frame of the map in the coordinates of the table [m].
+        offset: Offset of the frame of the map in the coordinates of the file [m].
+        unit: Metres per unit of the reference system of the file, horizontal and vertical.
     """
+    from app.batch.run_folder import truth_in_metres
     from pipeline.io.ground_truth import parse_truth_trees
 
     try:
@@ -225,6 +232,7 @@ def _imported(body: _Import, offset: tuple[float, float]) -> list[Content]:
     except SourceError as error:
         remedy = "Choose the unit of the diameter" if "unit" in error.what else error.remedy
         raise BadRequestError(error.what, where=error.where, remedy=remedy) from None
+    table = truth_in_metres(table, unit, offset)
     contents = contents_of(replace(table, x=table.x - offset[0], y=table.y - offset[1]))
     for line, content in enumerate(contents):
         _check(content, line)

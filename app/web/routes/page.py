@@ -8,7 +8,6 @@ import contextlib
 import mimetypes
 from collections.abc import AsyncIterator
 from functools import cache
-from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import Annotated
@@ -23,6 +22,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from app.common.user import current_user
 from app.dashboard.broadcast import Broadcast, Listener
 from app.dashboard.dashboard import Dashboard
+from app.extension import EXTENSION_PAGES, extensions_on, static_folder
 from app.web.auth import HEALTH, AccessTokens, role_of, ticket
 from app.web.responses import LARGEST_NUMBER, error_reply, json_reply
 from app.web.routes.access import Bounds, CallerRole, Dash
@@ -53,7 +53,7 @@ _VISER_POLICY = (
 @router.get("/")
 def page(request: Request) -> Response:
     """GET /: return the dashboard, or 304 if the browser has it."""
-    return _file(request, page_folder() / "index.html", _PAGE_POLICY)
+    return _file(request, static_folder() / "index.html", _PAGE_POLICY)
 
 
 @router.get(HEALTH)
@@ -66,24 +66,27 @@ async def health(dashboard: Dash) -> Response:
 @router.get("/runs")
 def runs_page(request: Request) -> Response:
     """GET /runs: return the page of all runs, or 304 if the browser has it."""
-    return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
+    return _file(request, static_folder() / "runs.html", _PAGE_POLICY)
 
 
-@router.get("/robots")
-def all_robots(request: Request) -> Response:
-    """GET /robots: redirect to the page of the fleet that this dashboard belongs to, with a ticket; 404
-    without a fleet."""
-    port = request.app.state.fleet_port
-    if port is None:
-        return error_reply(404, "this dashboard belongs to no fleet", remedy="Open / instead")
-    return lead_on(request, port)
+@router.get("/api/extensions")
+def page_modules() -> Response:
+    """GET /api/extensions: return an object with `modules` and `styles`, lists of the addresses of the
+    JavaScript modules and the style sheets of the extensions that are switched on."""
+    pages = {name: each.page for name, each in extensions_on().items() if each.page is not None}
+    styled = [name for name, page in pages.items() if (page / "main.css").is_file()]
+    return json_reply(
+        {
+            "modules": [f"/static/{EXTENSION_PAGES}/{name}/main.js" for name in pages],
+            "styles": [f"/static/{EXTENSION_PAGES}/{name}/main.css" for name in styled],
+        }
+    )
 
 
 @router.get("/api/access")
 def access(request: Request) -> Response:
     """GET /api/access: return an object with `role`, "owner" or "viewer"; `viewer_link`, the address
-    "/?token=...", and `viewers`, the number of pages that are open with it (both null for a viewer); and
-    `robots`, the address of the page of the fleet (null without a fleet)."""
+    "/?token=..."; and `viewers`, the number of pages that are open with it (both null for a viewer)."""
     role, tokens = role_of(request.scope), _tokens(request)
     owns = role == "owner"
     return json_reply(
@@ -91,7 +94,6 @@ def access(request: Request) -> Response:
             "role": role,
             "viewer_link": f"/?token={tokens.viewer}" if owns else None,
             "viewers": tokens.viewer_pages if owns else None,
-            "robots": None if request.app.state.fleet_port is None else "/robots",
         }
     )
 
@@ -170,26 +172,18 @@ def _page_path(path: str) -> Path | None:
     wanted = PurePosixPath(path)
     if "\0" in path or any(part.startswith(".") for part in wanted.parts):
         return None
-    folder = page_folder().resolve()
+    folder = static_folder()
+    if wanted.is_relative_to(EXTENSION_PAGES) and len(wanted.parts) > 2:
+        extension = extensions_on().get(wanted.parts[2])  # its files may be in another package
+        if extension is None or extension.page is None:
+            return None
+        folder, wanted = extension.page, PurePosixPath(*wanted.parts[3:])
     try:
+        folder = folder.resolve()
         found = (folder / wanted).resolve()
         return found if found.is_relative_to(folder) and found.is_file() else None
     except OSError:  # a name that no file system accepts
         return None
-
-
-@cache
-def page_folder() -> Path:
-    """Return the folder of index.html: `app/static` of an installed package, or `static/` of a checkout.
-
-    Raises:
-        StemmapError: Neither folder exists.
-    """
-    package = Path(str(files("app")))
-    for folder in (package / "static", package.parent / "static"):
-        if (folder / "index.html").is_file():
-            return folder
-    raise StemmapError("the page is missing", where=str(package / "static"), remedy="Install stemmap again")
 
 
 @cache

@@ -15,7 +15,16 @@ from pydantic import Field, field_validator
 from starlette.responses import Response
 
 from app.sources.opening import ask
-from app.sources.request import LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
+from app.sources.request import (
+    LARGEST_SEED,
+    LONGEST_URI,
+    FormChoice,
+    Role,
+    SourceRequest,
+    UnitChoice,
+    UpChoice,
+    mount_of_degrees,
+)
 from app.web.responses import BadRequestError, Body, Value, Word, json_reply
 from app.web.routes.access import Dash, Deployment, Permitted, checked_uri, permitted_request
 from app.worker.protocol import FASTEST, LONGEST_S, MOST_SCANS, Command
@@ -86,6 +95,9 @@ class _Source(Body):
     """
 
     uri: _Uri
+    form: FormChoice = "auto"
+    unit: UnitChoice = "auto"
+    up: UpChoice = "auto"
     odometry: Annotated[str, Field(max_length=LONGEST_URI)] = "auto"
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 0
     topics: dict[Role, Annotated[str, Field(max_length=256)]] = Field(default_factory=dict)
@@ -217,13 +229,13 @@ def _kind_of(path: Path) -> _Kind:
     """Return "recording" for a file or folder that is a recording by its name or the names in it; "folder"
     for another folder that is no link; "other" for hidden entries, finished runs, links to other folders,
     other files and entries that cannot be read."""
-    from pipeline.io.readers import expected_format, folder_opener
+    from pipeline.io.readers import folder_opener, is_recording
 
     with contextlib.suppress(OSError):
         if path.name.startswith(".") or (path / "run.json").is_file():
             return "other"
         if path.is_file():
-            return "recording" if expected_format(path) else "other"
+            return "recording" if is_recording(path) else "other"
         if path.is_dir():
             return "recording" if folder_opener(path) else "other" if path.is_symlink() else "folder"
     return "other"

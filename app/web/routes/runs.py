@@ -171,7 +171,7 @@ async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
 @router.delete("/{number}")
 async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
     """Delete a run that is not open, and return its number (`id`); `restore` undoes the deletion for a month.
-    409 if it is open here or in another dashboard of the fleet, 404 for an unknown run."""
+    409 if it is open here or in another dashboard of this server, 404 for an unknown run."""
     if number in request.app.state.open_records():
         here = number == dashboard.run_recorder.record
         what = "this run is open" if here else "this run is open in the dashboard of another robot"

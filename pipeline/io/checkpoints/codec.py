@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from pipeline.errors import StemmapError
-from pipeline.types.records import ADDED, NOT_SAVED
+from pipeline.types.records import NOT_SAVED
 
 R = TypeVar("R")
 _ALIGN = 8
@@ -135,8 +135,8 @@ def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
 
 
 def decode(kind: type[R], tree: Any, blob: bytes, *, planes: bool = False) -> R:  # noqa: ANN401
-    """Return the record that `encode` encoded. Fields with NOT_SAVED get their defaults, and missing fields
-    with ADDED the value of an earlier version. Arrays are copies.
+    """Return the record that `encode` encoded. Fields with NOT_SAVED get their defaults. Arrays are
+    copies.
 
     Args:
         kind: Type of the record.
@@ -200,29 +200,16 @@ def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN
 
 
 def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
-    """Return a dataclass of type `kind` from a dict of its saved fields. A missing field with ADDED gets the
-    result of the function ADDED for a dict of the other fields, or its default if ADDED is None.
+    """Return a dataclass of type `kind` from a dict of its saved fields.
 
     Raises:
         ValueError: `tree` is not a dict, or has other fields.
     """
     wanted = _saved(kind)
-    if not isinstance(tree, dict):
+    if not isinstance(tree, dict) or set(tree) != set(wanted):
         raise ValueError(f"{name} does not have the fields of this version")
-    added: dict[str, Any] = {}
-    if set(tree) != set(wanted):
-        added = {
-            f.name: f.metadata[ADDED] for f in fields(kind) if ADDED in f.metadata and f.name not in tree
-        }
-        if set(tree) != set(wanted) - set(added):
-            raise ValueError(f"{name} does not have the fields of this version")
     kinds = _hints(kind)
-    parts = {
-        part: _decoded(kinds[part], tree[part], blob, f"{name}.{part}")
-        for part in wanted
-        if part not in added
-    }
-    return kind(**parts, **{part: make(parts) for part, make in added.items() if make})
+    return kind(**{part: _decoded(kinds[part], tree[part], blob, f"{name}.{part}") for part in wanted})
 
 
 def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any, ...]:  # noqa: ANN401

@@ -4,7 +4,7 @@ first, then by the names."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -41,7 +41,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         path = Path(uri).expanduser()
         if path.is_dir() and folder_opener(path) is None and len(names := recordings_in(path)) == 1:
             return open_source(str(path / names[0]), chosen)
-        return _find_opener(path, uri)(uri, path, chosen)
+        return _find_opener(path, uri, chosen)(uri, path, chosen)
     except RuntimeError as error:  # the home folder of an unknown user
         raise SourceError("there is no such user", where=uri, remedy="Look at the path.") from error
     except (OSError, MemoryError) as error:
@@ -87,7 +87,7 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
         return open_simulated(uri, options)
     if scheme == "file":
         return open_source(path_of(uri), options)
-    if scheme in ("zenoh", "velodyne", "dds"):
+    if scheme in ("zenoh", "velodyne"):
         raise SourceError("a live robot cannot be read as a file", where=uri, remedy="Watch it or map it.")
     if scheme in _LIVE:
         raise SourceError(
@@ -95,11 +95,12 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
             where=uri,
             remedy="ROS 2 is heard over Zenoh, as zenoh:tcp/host:7447; or record it and open the file.",
         )
-    raise UsageError(f"unknown kind of source {scheme!r}", where=uri, remedy=READABLE)
+    raise UsageError(f"unknown kind of source {scheme!r}", where=uri, remedy=readable())
 
 
-def _find_opener(path: Path, uri: str) -> Opener:
-    """Return the opener for a path. `uri` is the path as the user wrote it, for errors.
+def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
+    """Return the opener for a path. `uri` is the path as the user wrote it, for errors; of the options the
+    form of a file of points is used.
 
     Raises:
         SourceError: The path does not exist, is an empty file, is neither a file nor a folder, or has an
@@ -111,26 +112,31 @@ def _find_opener(path: Path, uri: str) -> Opener:
     if path.is_dir():
         opener = folder_opener(path)
         if opener is None:
-            inside = named(recordings_in(path) or _folders_of_runs(path))
+            inside = named(recordings_in(path) + folders_of_runs(path))
             raise SourceError(
                 "the folder is no run" if inside else "nothing in the folder can be read",
                 where=uri,
-                remedy=f"Open what is in it: {inside}." if inside else READABLE,
+                remedy=f"Open what is in it: {inside}." if inside else readable(),
             )
         return opener
     if not path.is_file():
-        raise SourceError("neither a file nor a folder", where=uri, remedy=READABLE)
-    with path.open("rb") as file:
-        head = file.read(16)
+        raise SourceError("neither a file nor a folder", where=uri, remedy=readable())
+    head = _head_of(path)
     if not head:
-        raise SourceError("the file is empty", where=uri, remedy="Copy the file again, or record it again.")
+        raise SourceError(
+            "the file is empty",
+            where=uri,
+            remedy="Compare it with the original: if that is empty too, nothing was recorded.",
+        )
     kind = file_format(path, head)
+    if kind is not None and kind.holds_points:
+        return _cloud if is_cloud(str(path), options) else _scans
     if kind is None:
         promised = expected_format(path)
         what = (
             f"the contents are not those of a {promised.words} file" if promised else "not a LiDAR recording"
         )
-        raise SourceError(what, where=uri, remedy=READABLE)
+        raise SourceError(what, where=uri, remedy=readable())
     return kind.open
 
 
@@ -154,7 +160,6 @@ def _opener(module: str, function: str) -> Opener:
 
 _recording = _opener("live", "open_recording")
 _scans = _opener("scan_folder", "ScanFolder")
-_victoria_park = _opener("victoria_park", "VictoriaParkSource")
 _cloud = _opener("simulated", "open_cloud_drive")
 _tree_manager = _opener("tree_manager", "TreeManagerSource")
 
@@ -168,7 +173,9 @@ class Format:
         magic: Possible first bytes of the file; () if only its name identifies it.
         suffixes: Usual suffixes in lower case.
         open: Function of URI, path and options that opens the source.
-        is_cloud: Whether it is a whole cloud.
+        is_cloud: Whether it is usually a whole cloud.
+        holds_points: Whether it is a file of points: a whole cloud or one scan.
+        is_told_by_contents: Whether its contents tell which of them, see `cloud_or_scan`.
     """
 
     words: str
@@ -176,6 +183,15 @@ class Format:
     suffixes: tuple[str, ...]
     open: Opener
     is_cloud: bool = False
+    holds_points: bool = False
+    is_told_by_contents: bool = False
+
+
+def _points(
+    words: str, magic: tuple[bytes, ...], *suffixes: str, is_cloud: bool = True, told: bool = True
+) -> Format:
+    """Return a format of files of points, see `Format`."""
+    return Format(words, magic, suffixes, _cloud if is_cloud else _scans, is_cloud, True, told)
 
 
 _PCAP = (
@@ -185,70 +201,139 @@ FILES = (
     Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _recording),
     Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
-    Format("Velodyne .pcap", _PCAP, (".pcap",), _opener("velodyne", "PcapSource")),
-    Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria_park),
-    Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _scans),
-    Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud, is_cloud=True),
-    Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud, is_cloud=True),
-    Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), _cloud, is_cloud=True),
-    Format("whole cloud .npy or .npz", (b"\x93NUMPY",), (".npy", ".npz"), _cloud, is_cloud=True),
-    Format("KITTI .bin", (), (".bin",), _scans),
+    Format("Velodyne, Hesai or Ouster .pcap", _PCAP, (".pcap",), _opener("capture", "open_capture")),
+    _points(".pcd (whole cloud or scan)", (b"# .PCD", b"VERSION", b"FIELDS"), ".pcd", is_cloud=False),
+    _points("whole cloud .laz or .las", (b"LASF",), ".laz", ".las", told=False),
+    _points("whole cloud .e57", (b"ASTM-E57",), ".e57", told=False),
+    _points("whole cloud .ply", (b"ply\n", b"ply\r"), ".ply"),
+    _points("whole cloud .npy or .npz", (b"\x93NUMPY",), ".npy", ".npz"),
+    _points("KITTI .bin", (), ".bin", is_cloud=False),
+    _points("whole cloud as text (.xyz, .txt, .asc, .csv, .pts)", (), ".xyz", ".asc", ".pts", told=False),
 )
 
 _MOST_NAMED = 5
-READABLE = "Supported formats: " + ", ".join(
-    [kind.words for kind in FILES]
-    + [
+#: Suffixes of text that is a cloud only if its lines are points: poses, times and true trees have them too.
+_TEXTS = (".txt", ".csv")
+TEXT = FILES[-1]
+_further: list[Callable[[], Iterable[Format]]] = []
+
+
+def add_formats(further: Callable[[], Iterable[Format]]) -> None:
+    """Add formats to those of this package, which go first. The function is called whenever a file is
+    opened."""
+    _further.append(further)
+
+
+def formats() -> tuple[Format, ...]:
+    """Return all formats of files in the order in which they are tried."""
+    return (*FILES, *(kind for further in _further for kind in further()))
+
+
+def readable() -> str:
+    """Return what can be opened, as the remedy of an error."""
+    folders = (
         "a folder of .bin, .pcd, .ply, .npy, .npz, .las or .laz scans",
         "a rosbag2 folder",
         "a folder of TreeManagerState_<i>.csv with trajectory.txt",
         "sim:stand and the other sim: scenarios.",
-    ]
-)
+    )
+    return "Supported formats: " + ", ".join([*(kind.words for kind in formats()), *folders])
 
 
 def file_format(path: Path, head: bytes) -> Format | None:
     """Return the format of a file, None if it is unknown. The first bytes decide; the suffix decides for .npz
-    and for formats without magic bytes.
+    and for formats without magic bytes. A text with another suffix or none is a cloud if its lines are
+    points.
 
     Args:
         path: The file; it is not opened.
-        head: First bytes of the file.
+        head: First bytes of the file, as many as its first lines have.
     """
     if path.suffix.lower() == ".npz":  # a .zip by its contents
         return expected_format(path)
-    for kind in FILES:
+    for kind in formats():
         if any(head.startswith(mark) for mark in kind.magic):
             return kind
     suffix = path.suffix.lower()
-    return next((kind for kind in FILES if not kind.magic and suffix in kind.suffixes), None)
+    if suffix in _TEXTS:
+        return TEXT
+    known = next((kind for kind in formats() if not kind.magic and suffix in kind.suffixes), None)
+    return known or (TEXT if expected_format(path) is None and _is_text_of_points(head) else None)
+
+
+def _is_text_of_points(head: bytes) -> bool:
+    """Return whether a file is a text of points by its first bytes."""
+    from pipeline.io.readers.text_points import is_text_of_points
+
+    return is_text_of_points(head)
+
+
+_HEAD = 64 << 10  # bytes by which a format is found
+
+
+def _head_of(path: Path) -> bytes:
+    """Return the first bytes of a file; OSError if it cannot be read."""
+    with path.open("rb") as file:
+        return file.read(_HEAD)
 
 
 def expected_format(path: Path) -> Format | None:
     """Return the format by the suffix of a file, in upper or lower case; None for another suffix."""
-    return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
+    return next((kind for kind in formats() if path.suffix.lower() in kind.suffixes), None)
 
 
-def is_cloud(uri: str) -> bool:
-    """Return whether a file is a whole cloud by its first bytes or its name; a .pcd file is a scan. False for
-    a file that cannot be read."""
+def points_format(uri: str) -> Format | None:
+    """Return the format of a file of points by its first bytes or its name; None for other files and for one
+    that cannot be read."""
     try:
         path = Path(uri).expanduser()
-        with path.open("rb") as file:
-            head = file.read(16)
+        kind = file_format(path, _head_of(path)) or expected_format(path)
     except (OSError, ValueError, RuntimeError):
+        return None
+    return kind if kind is not None and kind.holds_points else None
+
+
+def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
+    """Return whether a file is a whole cloud, by the choice of the user, else by its format and its contents.
+    False for a file that cannot be read.
+
+    Args:
+        uri: Path as the user wrote it.
+        options: Choices of the user, of which the form is used; None for none.
+    """
+    from pipeline.io.readers.point_files import ScanFileError
+
+    kind, form = points_format(uri), "auto" if options is None else options.form
+    if kind is None or form != "auto":
+        return kind is not None and form == "cloud"
+    if not kind.is_told_by_contents:
+        return kind.is_cloud
+    from pipeline.io.readers.clouds import form_of_file
+
+    try:
+        return form_of_file(Path(uri).expanduser()).is_cloud
+    except (ScanFileError, OSError, MemoryError):
+        return kind.is_cloud  # its opening tells the reason
+
+
+def is_recording(path: Path) -> bool:
+    """Return whether a file is a run or a cloud by its suffix, a .txt or .csv by its first lines; False for
+    one that cannot be read."""
+    if path.suffix.lower() not in _TEXTS:
+        return expected_format(path) is not None
+    try:
+        return _is_text_of_points(_head_of(path))
+    except OSError:
         return False
-    kind = file_format(path, head) or expected_format(path)
-    return kind is not None and kind.is_cloud
 
 
 def recordings_in(folder: Path) -> list[str]:
-    """Return the sorted names of the files in a folder (not in folders in it) that are runs or clouds by
-    their suffixes; OSError if it cannot be read."""
-    return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
+    """Return the sorted names of the files in a folder (not in folders in it) that are runs or clouds, see
+    `is_recording`; OSError if it cannot be read."""
+    return sorted(path.name for path in folder.iterdir() if path.is_file() and is_recording(path))
 
 
-def _folders_of_runs(folder: Path) -> list[str]:
+def folders_of_runs(folder: Path) -> list[str]:
     """Return the sorted names, with a slash, of the folders in a folder that are runs or contain recordings;
     without those that cannot be read. OSError if the folder itself cannot be read."""
     found = []

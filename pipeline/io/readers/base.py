@@ -30,6 +30,14 @@ class RecordedTopic:
             "" if it is not read.
         fits: First role that `--topic` can give it, "" when there is none.
         why_not: Reason why it is not read; "" if it is read.
+        why: Reason why it is read and not another one of its kind; "" if it is the only one.
+        rate_hz: Mean rate of its messages [Hz]; None if it is unknown.
+        family: Family of the LiDAR; "" if it is unknown, or the topic has no scans.
+        fields: Names and types of the fields of its points, e.g. "x float32".
+        frame: Frame of its first message.
+        chain: Frames from `frame` to the base along fixed transforms, both included; () if there are none.
+        times: How the times of its points are read, or would be, or why they are not; "" for other topics.
+        range_sigma: Measured standard deviation of a range [m]; None if it is not measured.
     """
 
     name: str
@@ -38,6 +46,14 @@ class RecordedTopic:
     read_as: str
     fits: str
     why_not: str = ""
+    why: str = ""
+    rate_hz: float | None = None
+    family: str = ""
+    fields: tuple[str, ...] = ()
+    frame: str = ""
+    chain: tuple[str, ...] = ()
+    times: str = ""
+    range_sigma: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +90,8 @@ class SourceDescription:
         revisions: Parameters of a recorded run, in the order of their scans.
         gnss: How GNSS fixes are used, as text; "" when they are not used.
         other_slam: How the poses of another SLAM are used, as text; "" when they are not used.
+        missing: What a recording lacks, what this costs, and what helps, one text each.
+        has_times: Whether the source has the times of its scans; otherwise a rate is assumed.
     """
 
     uri: str
@@ -92,6 +110,8 @@ class SourceDescription:
     revisions: tuple[Revision, ...] = ()
     gnss: str = ""
     other_slam: str = ""
+    missing: tuple[str, ...] = ()
+    has_times: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +124,18 @@ class SourceOptions:
         T_base_lidar: Extrinsics of the LiDAR; None means those of the source, else identity.
         seed: Random seed of simulated runs.
         as_live: Of the recording of a live run: read only the messages that the live run mapped.
+        form: Whether a file of points is a whole "cloud" or one "scan"; "auto" decides by its contents.
+        unit: Unit of the coordinates of a whole cloud, a key of `cloud_frame.UNITS`; "auto" finds it.
+        up: Axis of a whole cloud that points up, a key of `up_axis.UP`; "auto" finds it.
     """
 
     topics: dict[str, str] = field(default_factory=dict)
     T_base_lidar: Pose3 | None = None
     seed: int = 0
     as_live: bool = False
+    form: str = "auto"
+    unit: str = "auto"
+    up: str = "auto"
 
 
 class Source(Protocol):

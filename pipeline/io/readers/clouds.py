@@ -1,8 +1,9 @@
-"""Whole clouds of plots, read part by part: LAS, LAZ, E57, PLY, NumPy arrays and PCD."""
+"""Whole clouds of plots, read part by part: LAS, LAZ, E57, PLY, NumPy arrays, PCD and text."""
 
 from __future__ import annotations
 
 import struct
+from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -12,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss, digest_of
+from pipeline.io.readers.base import COORDINATE_LIMIT, SourceOptions, count_loss, digest_of
+from pipeline.io.readers.cloud_frame import CloudSample, FileFrame, frame_of, sample_of
+from pipeline.io.readers.cloud_or_scan import Form, form_of, is_told_by_points
 from pipeline.io.readers.point_files import (
+    EXPORT,
     MISSING,
     MOST_POINTS,
     PART,
@@ -22,8 +26,11 @@ from pipeline.io.readers.point_files import (
     PointTable,
     ScanFileError,
     errors_as_damage,
+    is_table,
+    open_rows,
     open_table,
 )
+from pipeline.io.readers.text_points import open_text
 from pipeline.types.records import CloudDescription, Float, Float32
 
 if TYPE_CHECKING:
@@ -32,15 +39,19 @@ if TYPE_CHECKING:
 _AXES = ("x", "y", "z")
 
 
-def open_cloud(uri: str) -> PointCloud:
-    """Open a whole cloud by its first bytes or its suffix: E57, LAS or LAZ, else a PLY, NumPy or PCD file.
+def open_cloud(uri: str, options: SourceOptions | None = None) -> PointCloud:
+    """Open a whole cloud by its first bytes or its suffix: E57, LAS or LAZ, PLY, NumPy, PCD or text.
+
+    Args:
+        uri: Path as the user wrote it.
+        options: Choices of the user, of which the unit and the axis that points up are used; None for none.
 
     Raises:
-        SourceError: The file does not exist, has an unknown format, or is damaged.
+        SourceError: The file does not exist, has an unknown format, or is damaged; or its unit is unknown.
     """
     try:
         path = Path(uri).expanduser()
-        return PointCloud(uri, path, open_points(path))
+        return PointCloud(uri, path, open_points(path), options or SourceOptions())
     except ScanFileError as error:
         raise SourceError(str(error), where=uri, remedy=error.remedy) from None
     except MemoryError:
@@ -53,7 +64,8 @@ def open_cloud(uri: str) -> PointCloud:
 
 
 def open_points(path: Path) -> PointTable:
-    """Return the table of a file: LAS, LAZ and E57 by its first bytes or its suffix, else by `open_table`.
+    """Return the table of a file: LAS, LAZ and E57 by its first bytes or its suffix, else by `open_table`;
+    KITTI .bin by its suffix, and text by its lines.
 
     Raises:
         ScanFileError: The file has an unknown format, contradicts itself, or has no x, y and z; or it is an
@@ -61,12 +73,25 @@ def open_points(path: Path) -> PointTable:
         OSError: The file cannot be read.
     """
     with path.open("rb") as file:
-        head = file.read(8)
-    if head == b"ASTM-E57" or path.suffix.lower() == ".e57":
+        head = file.read(16)
+    if head[:8] == b"ASTM-E57" or path.suffix.lower() == ".e57":
         return _open_e57(path)
     if head.startswith(b"LASF") or path.suffix.lower() in (".las", ".laz"):
         return _open_las(path)
-    return open_table(path)
+    if is_table(head):
+        return open_table(path)
+    return open_rows(path) if path.suffix.lower() == ".bin" else open_text(path)
+
+
+def form_of_file(path: Path) -> Form:
+    """Return whether a PCD, PLY, NumPy or KITTI .bin file is a whole cloud or one scan.
+
+    Raises:
+        ScanFileError: The file is damaged.
+        OSError: The file cannot be read.
+    """
+    table = open_points(path)
+    return form_of(table, sample_of(table) if is_told_by_points(table) else None)
 
 
 def is_place(xyz: Float) -> NDArray[np.bool_]:
@@ -92,38 +117,49 @@ class PointCloud:
         uri: Path as the user wrote it.
         path: The file.
         table: Table of the file.
+        options: Choices of the user.
 
     Raises:
-        ScanFileError: The file is damaged, or has no valid point.
+        ScanFileError: The file is damaged, has no valid point, or its unit is unknown.
         OSError: The file cannot be read.
     """
 
-    def __init__(self, uri: str, path: Path, table: PointTable) -> None:
-        """Read the first points, which decide the offset, and the digest.
+    def __init__(self, uri: str, path: Path, table: PointTable, options: SourceOptions) -> None:
+        """Read a sample of the points, which decides unit and axes, the first points, which decide the
+        offset, and the digest.
 
         Raises:
-            ScanFileError: The file is damaged, or has no valid point.
+            ScanFileError: The file is damaged, has no valid point, or its unit is unknown.
             OSError: The file cannot be read.
         """
         self._table = table
         self.losses: dict[str, int] = {}
+        sample = sample_of(table)
+        self._frame = frame = frame_of(table, sample, options.unit, options.up)
         for xyz in self._positions():
             first = xyz[is_place(xyz)][:1000]
             if len(first):
                 break
         else:
-            raise ScanFileError("the cloud has no points with valid coordinates")
+            raise ScanFileError("the cloud has no points with valid coordinates", EXPORT)
+        low, high = _corners(table, sample, frame)
+        form = form_of(table, sample) if options.form == "auto" and is_told_by_points(table) else None
         self.description = CloudDescription(
             uri,
             table.kind,
             table.points,
             offset_for(first.mean(axis=0)),
-            crs=table.crs,
+            crs=frame.crs,
             digest=digest_of([path]),
-            low=table.low,
-            high=table.high,
+            warnings=((form.words,) if form is not None and form.is_cloud else ()) + frame.warnings,
+            low=low,
+            high=high,
             attributes=(*(name for name in table.names if name not in _AXES), *table.attributes),
             cut_above=table.cut_above,
+            unit=frame.unit_words,
+            up=f"{frame.up}, {frame.up_words}",
+            form="as requested" if options.form == "cloud" else form.why if form is not None else "",
+            crs_unit=frame.crs_unit,
         )
 
     def parts(self) -> Iterator[Float32]:
@@ -150,15 +186,33 @@ class PointCloud:
             raise SourceError(what, where=self.description.uri, remedy=REMEDY) from None
         except ScanFileError as error:
             raise SourceError(str(error), where=self.description.uri, remedy=error.remedy) from None
-        if read < self.description.points:
+        if read < self.description.points and self._table.exact:
             count_loss(self.losses, MISSING, self.description.points - read)
 
     def _positions(self) -> Iterator[Float]:
-        """Yield the coordinates of all rows, valid or not, shape (N, 3) [m], in the frame of the file; errors
-        are those of `PointTable.parts`."""
+        """Yield the coordinates of all rows, valid or not, shape (N, 3), in metres with z up; errors are
+        those of `PointTable.parts`."""
         for columns in self._table.parts():
             with np.errstate(over="ignore", invalid="ignore"):
-                yield np.stack([columns[axis].astype(np.float64) for axis in _AXES], axis=1)
+                yield self._frame.apply(
+                    np.stack([columns[axis].astype(np.float64) for axis in _AXES], axis=1)
+                )
+
+
+def _corners(
+    table: PointTable, sample: CloudSample, frame: FileFrame
+) -> tuple[Float, Float] | tuple[None, None]:
+    """Return the lowest and the highest corner of a cloud in metres with z up, shape (3,) each: by the
+    header, else those of the sample; None if neither is known."""
+    if table.low is not None and table.high is not None:
+        corners = np.stack([table.low, table.high])
+    elif len(sample.xyz):
+        corners = np.stack([sample.xyz.min(axis=0), sample.xyz.max(axis=0)])
+    else:
+        return None, None
+    with np.errstate(over="ignore", invalid="ignore"):
+        turned = frame.apply(corners)
+    return (turned[0], turned[1]) if frame.up == "z" else (turned.min(axis=0), turned.max(axis=0))
 
 
 # --- LAS and LAZ ---
@@ -191,14 +245,16 @@ def _open_las(path: Path) -> PointTable:
         with _las_reader(path) as reader:
             header = reader.header
             scales, offsets = header.scales.copy(), header.offsets.copy()
-            crs, system = _crs_of(header), str(header.system_identifier).rstrip("\0")
+            (crs, units), system = _crs_of(header), str(header.system_identifier).rstrip("\0")
             dimensions = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
             low, high = (np.array(corner, np.float64) for corner in (header.mins, header.maxs))
 
-    def read() -> Iterator[Columns]:
-        """Yield the coordinates of the points that the file can hold, float64 [m]."""
-        left = there
+    def read(begin: int = 0) -> Iterator[Columns]:
+        """Yield the coordinates of the points that the file can hold from the point `begin` on, float64."""
+        left = there - begin
         with _las_reader(path) as reader:
+            if begin:
+                reader.seek(begin)
             while left and len(chunk := reader.read_points(min(_LAS_PART, left))):
                 raw = np.stack([np.asarray(chunk[axis], np.float64) for axis in ("X", "Y", "Z")])
                 with np.errstate(over="ignore", invalid="ignore"):
@@ -214,6 +270,7 @@ def _open_las(path: Path) -> PointTable:
         read,
         attributes=dimensions,
         crs=crs,
+        units=units,
         low=low,
         high=high,
         cut_above=system == SYSTEM_OF_DRIVE,
@@ -362,26 +419,48 @@ def _check_chunks(file: IO[bytes], first: int, size: int) -> None:
         raise ScanFileError("the header of the LAS file contradicts itself")
 
 
-def _crs_of(header: laspy.LasHeader) -> str:
-    """Return the coordinate reference system of the header: WKT, or "EPSG:" with the number of the projected
-    or else geographic system; "" if there is none."""
+_WKT, _GEO_KEYS = 2112, 34735  # numbers of records of LAS
+#: GeoTIFF keys: systems of positions (a projected one before a geographic one) and of heights, and their
+#: units, which count where the system is user-defined; for heights always, because writers name NAVD88 so.
+_PROJECTED, _GEOGRAPHIC, _PROJECTED_UNIT, _VERTICAL, _VERTICAL_UNIT = 3072, 2048, 3076, 4096, 4099
+_EPSG_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
+
+
+def _crs_of(header: laspy.LasHeader) -> tuple[str, tuple[str, str]]:
+    """Return the coordinate reference system of the header, and units that it names apart from it.
+
+    Returns:
+        WKT, or "EPSG:" with the number of the projected or else geographic system, and of heights after a
+        "+"; "" if there is none. The units of positions and heights as in `PointTable.units`.
+    """
     for record in header.vlrs:
-        if record.record_id == 2112:
+        if record.record_id == _WKT:
             wkt = str(getattr(record, "string", "")).strip("\0 \n")
             if wkt:
-                return wkt
+                return wkt, ("", "")
+    keys: dict[int, int] = {}
     for record in header.vlrs:
-        if record.record_id == 34735:
-            keys = {int(key.id): key for key in getattr(record, "geo_keys", ())}
-            for name in (3072, 2048):  # a projected system before a geographic one
-                key = keys.get(name)
-                if (
-                    key is not None
-                    and int(key.tiff_tag_location) == 0
-                    and 1024 <= int(key.value_offset) < 32767
-                ):
-                    return f"EPSG:{int(key.value_offset)}"
-    return ""
+        if record.record_id == _GEO_KEYS:
+            for key in getattr(record, "geo_keys", ()):
+                if int(key.tiff_tag_location) == 0:
+                    keys.setdefault(int(key.id), int(key.value_offset))
+    systems = [keys[k] for k in (_PROJECTED, _GEOGRAPHIC) if 1024 <= keys.get(k, 0) < 32767]
+    high = _EPSG_UNITS.get(keys.get(_VERTICAL_UNIT, 0), "")
+    if not systems:
+        return "", (_EPSG_UNITS.get(keys.get(_PROJECTED_UNIT, 0), ""), high)
+    vertical = keys.get(_VERTICAL, 0)
+    heights = f"+{vertical}" if 1024 <= vertical < 32767 and _is_vertical(vertical) else ""
+    return f"EPSG:{systems[0]}{heights}", ("", high)
+
+
+def _is_vertical(number: int) -> bool:
+    """Return whether PROJ knows a system of heights by its EPSG number; old files name a datum instead."""
+    import pyproj
+
+    try:
+        return bool(pyproj.CRS.from_epsg(number).is_vertical)
+    except pyproj.exceptions.ProjError:
+        return False
 
 
 # --- E57 ---
@@ -412,14 +491,18 @@ def _open_e57(path: Path) -> PointTable:
     if not all(0 <= n <= MOST_POINTS for n in points) or sum(points) > MOST_POINTS:
         raise ScanFileError("it promises more points than there can be")
 
-    def read() -> Iterator[Columns]:
-        """Yield the coordinates of the points of all stations, float64 [m]."""
+    starts = np.cumsum([0, *points])[:-1].tolist()
+
+    def read(begin: int = 0) -> Iterator[Columns]:
+        """Yield the coordinates of the points of all stations from the one of the point `begin` on, float64
+        [m]."""
         with closing(E57(str(path))) as file:
-            for station in range(stations):
+            for station in range(bisect_right(starts, begin) - 1, stations):
                 for xyz in _station(file, station):
                     yield dict(zip(_AXES, xyz.T, strict=True))
 
-    return PointTable(f"E57, {stations} station{'s' * (stations != 1)}", sum(points), _AXES, read)
+    kind = f"E57, {stations} station{'s' * (stations != 1)}"
+    return PointTable(kind, sum(points), _AXES, read, starts=tuple(starts), units=("m", "m"))
 
 
 def _station(file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types

@@ -9,7 +9,7 @@ from __future__ import annotations
 import bz2
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -31,9 +31,14 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 DAMAGE = (McapError, struct.error, ValueError, KeyError, OverflowError)
 #: A file with more damaged or unknown records has another format, and would take long to read.
 STRANGE_LIMIT = 1000
-#: A channel whose times of recording go back by more shows that the clock of the recorder was set [ns].
-STEP_BACK_NS = 2_000_000_000
+#: Times of recording of a topic that go back by more show that the clock of the recorder was set [ns].
+#: Threads of a recorder change the order of messages by less.
+STEP_BACK_NS = 50_000_000
 MOST_STEPS = 100
+#: Message types of transforms of ROS 2 and ROS 1.
+TRANSFORM_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+#: Remedy for a damaged file.
+COMPARE = "Compare its size with that of the original: if they are equal, the damage is from the recording."
 #: Number of messages that are left behind `Container.tail_ns`.
 TAIL = 3
 
@@ -85,11 +90,18 @@ class Container:
     #: What is counted for a message whose bytes cannot be read.
     unreadable = "messages that cannot be read"
 
-    def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of recording [ns] of the last message but two of some channels, of the first one if
-        there are fewer; 0 if there is none."""
+    def tail_ns(self, numbers: Collection[int], last: int = TAIL) -> int:
+        """Return the time of recording [ns] of the `last` message from the end of some channels, of the first
+        one if there are fewer; 0 if there is none."""
         rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
-        return int(self.index[rows[-TAIL:][0], 1]) if len(rows) else 0
+        return int(self.index[rows[-last:][0], 1]) if len(rows) else 0
+
+    def rate_hz(self, numbers: Collection[int]) -> float | None:
+        """Return the mean rate of the messages of some channels by their times of recording [Hz]; None for
+        fewer than two."""
+        times = self.index[np.isin(self.index[:, 0], list(numbers)), 1]
+        span_ns = int(times[-1] - times[0]) if len(times) > 1 else 0
+        return round((len(times) - 1) / span_ns * 1e9, 1) if span_ns > 0 else None
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
@@ -152,24 +164,34 @@ class Container:
         raise NotImplementedError
 
 
-def shift_after_steps(index: Int) -> int:
+def shift_after_steps(index: Int, channels: Mapping[int, Channel]) -> int:
     """Shift times behind steps back of the recorder's clock, see `Container.clock_steps`; return the number
-    of steps, at most MOST_STEPS. A step is a time that is more than STEP_BACK_NS earlier than one of its
-    channel before; the times then continue behind all messages before.
+    of steps, at most MOST_STEPS.
+
+    A step is a time that is more than STEP_BACK_NS earlier than one of its topic before, as is the next time
+    of the topic: a single one is out of order. The times then continue behind all messages before. Topics of
+    transforms show no steps: their publishers may add times in the future.
 
     Args:
         index: As in `Container._set_index`; its times are changed in place.
+        channels: Dict from numbers to channels; others show no steps.
     """
-    channel, time = index[:, 0], index[:, 1]
+    time, topic = index[:, 1], np.full(len(index), -1, np.int64)
+    names = sorted({channel.topic for channel in channels.values() if channel.msgtype not in TRANSFORM_TYPES})
+    for number, channel in channels.items():
+        if channel.topic in names:
+            topic[index[:, 0] == number] = names.index(channel.topic)
+    rows = [np.flatnonzero(topic == k) for k in range(len(names))]
     for steps in range(MOST_STEPS):
-        back = np.zeros(len(time), dtype=np.bool_)
-        for number in np.unique(channel):
-            own = np.flatnonzero(channel == number)
-            back[own[1:]] = time[own[1:]] < np.maximum.accumulate(time[own])[:-1] - STEP_BACK_NS
-        if not back.any():
+        first = len(time)
+        for own in rows:
+            early = time[own] < np.maximum.accumulate(time[own]) - STEP_BACK_NS
+            early[:-1] &= early[1:]
+            if early.any():
+                first = min(first, int(own[np.argmax(early)]))
+        if first == len(time):
             return steps
-        first = int(np.argmax(back))
-        own = time[:first][channel[:first] == channel[first]]
+        own = time[:first][topic[:first] == topic[first]]
         due_ns = 2 * own[-1] - own[-2] if len(own) > 1 else own[-1]
         time[first:] += max(due_ns, time[:first].max()) - time[first]
     return MOST_STEPS
@@ -182,14 +204,15 @@ def ros2_type_name(name: str) -> str:
     return "/".join([parts[0], "msg", parts[1]]) if len(parts) == 2 else "/".join(parts)
 
 
-def damaged(what: str, path: object) -> SourceError:
+def damaged(what: str, path: object, remedy: str = COMPARE) -> SourceError:
     """Return the error for a file that cannot be read at all.
 
     Args:
         what: Description of the damage.
         path: The file.
+        remedy: What helps.
     """
-    return SourceError(what, where=str(path), remedy="Copy the file again, or record it again.")
+    return SourceError(what, where=str(path), remedy=remedy)
 
 
 # --- compressed blocks -----------------------------------------------------------------------------
@@ -320,10 +343,14 @@ class ChunkedFile(Container):
                 rows[:, 2] += number << 32
                 index.append(rows)
             if not self._known:
-                raise damaged("the recording holds no messages that can be read", path)
+                raise damaged(
+                    "the recording holds no messages that can be read",
+                    path,
+                    "Nothing was written to it: look at the topics of the recorder, and at its disk.",
+                )
             table = np.concatenate(index)
             recorded_ns = table[:, 1].copy()
-            self.clock_steps = shift_after_steps(table)
+            self.clock_steps = shift_after_steps(table, self._known)
             self._places, self._shifts_ns = table[:, 2], table[:, 1] - recorded_ns
             self._set_index((self._known[number] for number in sorted(self._known)), table)
         except BaseException:
@@ -371,7 +398,7 @@ class ChunkedFile(Container):
             self._file.seek(offset)
             return self._file.read(size)
         except OSError as error:
-            raise damaged(f"cannot read on: {error.strerror}", self._path) from error
+            raise damaged(f"cannot read on: {error.strerror}", self._path, "Look at the disk.") from error
 
     def _bytes_of(self, chunk: Chunk) -> bytes:
         """Return the unpacked bytes of a chunk. The last chunks stay in memory, up to BLOCK_LIMIT bytes,

@@ -32,7 +32,8 @@ from pipeline.io.readers.camera import (
 )
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import SECOND_NS, header_stamp
-from pipeline.io.readers.ros import RosSource
+from pipeline.io.readers.ouster import with_packets_decoded
+from pipeline.io.readers.ros import EmptyScansError, RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
 from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed, standard_types
 from pipeline.io.readers.transforms import Extrinsics, TransformTree
@@ -44,7 +45,8 @@ OPENING_NS = SECOND_NS
 OPENING_SCANS = 10
 #: Most messages that are kept before the first scan.
 OPENING_LIMIT = 4000
-_TRIES = 5
+#: Number of times that only unreadable scans arrived in OPENING_NS, after which the run is given up.
+_TRIES = 15
 T = TypeVar("T")
 
 
@@ -90,6 +92,8 @@ class ArrivalReader:
         self._scan_ns = 0
         self._heard = 0
         self._failures = 0
+        self._ended = False
+        self._refused: SourceError | None = None
         self._source: RosSource | None = None
         self.description: SourceDescription | None = None
         self.losses: dict[str, int] = {}
@@ -113,7 +117,8 @@ class ArrivalReader:
         `_forget_oldest`. Dropped messages, and what cannot be used, are counted in `losses`.
 
         Raises:
-            SourceError: There are scans, and none could be read in five attempts of OPENING_NS.
+            SourceError: There are scans, and none could be read in _TRIES attempts of OPENING_NS. Scans
+                without points are waited out.
         """
         if self._source is not None:
             return self._records_of(self._source, message)
@@ -124,7 +129,7 @@ class ArrivalReader:
             self._first_ns = message.log_ns if self._first_ns is None else self._first_ns
         if len(self._opening) > OPENING_LIMIT:
             self._forget_oldest()
-        if self._first_ns is None:
+        if self._first_ns is None or not self._heard:
             return []
         if self._heard < OPENING_SCANS and message.log_ns < self._first_ns + OPENING_NS:
             return []
@@ -139,7 +144,9 @@ class ArrivalReader:
         """
         if self._source is not None or self._first_ns is None:
             return []
-        self._failures = _TRIES
+        self._ended = True
+        if not self._heard and self._refused is not None:
+            raise self._refused
         return self._open(self._first_ns)
 
     def _forget_oldest(self) -> None:
@@ -151,20 +158,24 @@ class ArrivalReader:
         count_loss(self.losses, "messages that waited too long for scans", half - len(old))
 
     def _open(self, now_ns: int) -> list[Record]:
-        """Describe the source by the waiting messages; return their records. If no scan can be read, wait for
-        another OPENING_NS from `now_ns` on and return [].
+        """Describe the source by the waiting messages; return their records. If no scan can be read, or all
+        are empty, they are removed and counted, and [] is returned after the next OPENING_NS begins at
+        `now_ns`.
 
         Raises:
-            SourceError: No scan could be read _TRIES times.
+            SourceError: No scan could be read _TRIES times, or the input has ended.
         """
         heard = MessageList(self._kind, self._channels, self._opening)
         try:
             self._source = RosSource(self._uri, heard, [], self._options, live=True)
-        except SourceError:
-            self._failures += 1
-            if self._failures >= _TRIES:
+        except SourceError as error:
+            self._failures += not isinstance(error, EmptyScansError)
+            if self._failures >= _TRIES or self._ended:
                 raise
-            self._first_ns, self._heard = now_ns, 0  # wait another second
+            self._refused, waiting = error, len(self._opening)
+            self._opening = [m for m in self._opening if m.channel not in self._scans]
+            count_loss(self.losses, "scans before the first one with points", waiting - len(self._opening))
+            self._first_ns, self._heard, self._scan_ns = now_ns, 0, 0
             return []
         known = self._source.description
         self.description = replace(known, scans=None, end_ns=None, digest="")
@@ -372,7 +383,11 @@ class LiveRecording(MessageSource):
         reader = self._opened_reader()
         self.base, self._offset_ns = reader.base, reader.offset_ns
         if reader.description is None:
-            raise SourceError("there is no scan in it", where=uri, remedy="Record the LiDAR's topic.")
+            raise SourceError(
+                "there is no scan in it",
+                where=uri,
+                remedy="The robot sent no scans that can be read while it was recorded.",
+            )
         self._description = self._describe(reader.description, paths)
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int:
@@ -535,7 +550,7 @@ def open_recording(uri: str, path: Path, options: SourceOptions) -> Source:
         run = read_live_header(container, uri)
         if run is not None:
             return LiveRecording(uri, container, run, paths, options)
-        return RosSource(uri, container, paths, options)
+        return RosSource(uri, with_packets_decoded(container, path, options, uri), paths, options)
     except BaseException:
         container.close()
         raise

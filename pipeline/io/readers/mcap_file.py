@@ -119,7 +119,7 @@ class McapFile(ChunkedFile):
         self._definitions: dict[int, records.Channel] = {}
         self._further: list[tuple[int, int, int]] = []  # opcode, position and length of other records
         if self._read(0, len(MAGIC)) != MAGIC:
-            raise damaged("not an MCAP file", self._path)
+            raise damaged("not an MCAP file", self._path, "Name a file that a ROS 2 recorder wrote.")
         at, strange, whole = len(MAGIC), 0, False
         while at + RECORD.size <= end:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))

@@ -21,6 +21,7 @@ from pipeline.geometry.poses import Float, Pose2, Pose3, wrap_angle
 from pipeline.io.readers.base import SourceDescription
 from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.message_time import Stamped
+from pipeline.io.readers.scan_frames import MovingLink
 from pipeline.io.readers.topics import Topics
 from pipeline.types.records import Int, Odometry, PoseMeasurement
 
@@ -472,7 +473,7 @@ _MOST_READINGS = 60_000
 #: Number of unusable readings after which a source without any usable one is given up.
 _HOPELESS = 200
 
-TimesOf = Callable[[Message, dict[str, int]], Iterator[Stamped[Message | Odometry]]]
+TimesOf = Callable[[Message, dict[str, int]], Iterator[Stamped[Message | Odometry | MovingLink]]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -542,12 +543,14 @@ class FrameAlignment:
         self._unusable, self._fault = 0, ""
         self.refused = ""
 
-    def add(self, stamped: Stamped[Message | Odometry]) -> Any:  # noqa: ANN401 - GnssFrame or OtherFrame
+    def add(self, stamped: Stamped[Message | Odometry | MovingLink]) -> Any:  # noqa: ANN401 - GnssFrame or OtherFrame
         """Process the next message or odometry. Return the frame (GnssFrame or OtherFrame) once it is known,
         else None; if it can never be known, `refused` is set. Messages of other channels are ignored."""
         content = stamped.content
         if isinstance(content, Odometry):
             self._add_odometry(content)
+        elif isinstance(content, MovingLink):
+            return None
         elif content.channel in self.readings:
             return self._add_reading(content, stamped.stamp_ns)
         elif content.channel in self._odometry:
@@ -702,7 +705,7 @@ class FrameAlignments:
                 description = replace(description, warnings=warnings)
         return description
 
-    def add(self, stamped: Stamped[Message | Odometry]) -> None:
+    def add(self, stamped: Stamped[Message | Odometry | MovingLink]) -> None:
         """Process the next message or odometry of a live run, before it is decoded to a record. A frame that
         becomes known is passed to the decoder; this, or the reason why readings are not used, is added to
         `notices`."""

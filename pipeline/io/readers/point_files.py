@@ -16,14 +16,16 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.readers.base import count_loss
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss
 from pipeline.io.readers.pose_files import read_rows
 from pipeline.io.readers.scan_columns import POINT_LIMIT
 from pipeline.jit import compiled
@@ -45,6 +47,13 @@ _DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeErro
 
 
 REMEDY = "Copy the file again, or export it again"  # of a damaged file
+EXPORT = "Export it with x, y and z, as .laz or .ply"  # of a sound file with other contents
+ARRAY = "Save x, y, z as an array of numbers of shape (N, 3)"  # of a sound NumPy file with other contents
+#: Reason and remedy of a cloud whose positions are longitudes and latitudes.
+DEGREES = (
+    "its positions are degrees of longitude and latitude",
+    "Convert it to a projected reference system in metres, such as the UTM zone of the plot",
+)
 
 
 class ScanFileError(Exception):
@@ -84,29 +93,40 @@ class PointTable:
         kind: Name of the format, e.g. "PLY binary".
         points: Number of points by the header.
         names: Names of the columns with one number per point, in lower case; x, y and z are among them.
-        read: Function that yields all points in parts, dicts from names to columns of equal length. Numbers
-            need not be finite. It may raise any exception at damaged data; see `parts`.
+        read: Function that yields the points in parts, dicts from names to columns of equal length, from the
+            point with the given index on, or, where the format cannot skip, from an earlier one. Numbers need
+            not be finite. It may raise any exception at damaged data; see `parts`.
         attributes: Names of the values of a point that are not read, besides its coordinates.
         crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
         low, high: Corners by the header, shape (3,) [m]; not checked. None if unknown.
         cut_above: Whether the field of view of a sensor cuts the trees, as in the cloud of a drive.
         invalid: What is counted for a point whose coordinates are not finite or too large.
+        starts: Points from which `read` can begin without reading those before; () for any.
+        units: Units of x and y, and of z, by the file itself, as in `cloud_frame.UNITS`; "" if it names none.
+        exact: Whether `points` is a number that the file promises, and no estimate.
+        view: Pose of the sensor by the file (PCD); None if it names none or the identity.
+        height: Rows of an organised cloud; 1 for others.
     """
 
     kind: str
     points: int
     names: tuple[str, ...]
-    read: Callable[[], Iterator[Columns]]
+    read: Callable[[int], Iterator[Columns]]
     attributes: tuple[str, ...] = ()
     crs: str = ""
     low: Float | None = None
     high: Float | None = None
     cut_above: bool = False
     invalid: str = "points without coordinates"
+    starts: tuple[int, ...] = ()
+    units: tuple[str, str] = ("", "")
+    exact: bool = True
+    view: Pose3 | None = None
+    height: int = 1
 
-    def parts(self) -> Iterator[Columns]:
-        """Yield all points in parts, see `read`. Of a file that is cut or damaged, or cannot be read on, the
-        points before that place are yielded.
+    def parts(self, begin: int = 0) -> Iterator[Columns]:
+        """Yield the points in parts from the point `begin` on, see `read`. Of a file that is cut or damaged,
+        or cannot be read on, the points before that place are yielded.
 
         Raises:
             ScanFileError: The data is damaged before its first point.
@@ -115,12 +135,35 @@ class PointTable:
         read = 0
         try:
             with errors_as_damage("its data is damaged"):
-                for part in self.read():
+                for part in self.read(begin):
                     read += len(part["x"])
                     yield part
         except (ScanFileError, OSError):
             if read == 0:
                 raise
+
+
+_PLY = (b"ply\n", b"ply\r")
+_PCD = (b"# .PCD", b"VERSION", b"FIELDS")
+_NPY = b"\x93NUMPY"
+_ZIP = (b"PK\x03\x04", b"PK\x05\x06")
+
+
+def is_table(head: bytes) -> bool:
+    """Return whether a file is a PLY, PCD or NumPy file by its first bytes (at least 8)."""
+    return head.startswith((*_PLY, *_PCD, _NPY, *_ZIP))
+
+
+def open_rows(path: Path) -> PointTable:
+    """Return the table of a KITTI .bin file: x, y, z and reflectance as float32.
+
+    Raises:
+        ScanFileError: It is too large, or shorter than a point.
+        OSError: The size of the file cannot be read.
+    """
+    size = path.stat().st_size
+    dtype = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+    return _binary_table(path, "KITTI .bin", size // dtype.itemsize, [_Stream(0, dtype, size)])
 
 
 def open_table(path: Path) -> PointTable:
@@ -132,16 +175,16 @@ def open_table(path: Path) -> PointTable:
     """
     with path.open("rb") as file:
         head = file.read(_HEADER_LIMIT)
-    if head.startswith((b"ply\n", b"ply\r")):
+    if head.startswith(_PLY):
         return _open_ply(path, head)
-    if head.startswith((b"# .PCD", b"VERSION", b"FIELDS")):
+    if head.startswith(_PCD):
         return _open_pcd(path, head)
-    if head.startswith(b"\x93NUMPY"):
+    if head.startswith(_NPY):
         array = _npy_header(io.BytesIO(head), None, path.stat().st_size)
         return _binary_table(path, "NumPy .npy", array.shape[0], array.streams())
-    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+    if head.startswith(_ZIP):
         return _open_npz(path)
-    raise ScanFileError("its contents are not those of a PLY, NumPy or PCD file")
+    raise ScanFileError("its contents are not those of a PLY, NumPy or PCD file", EXPORT)
 
 
 def read_columns(table: PointTable, losses: dict[str, int]) -> Columns:
@@ -188,7 +231,7 @@ def _usable(names: list[str]) -> tuple[str, ...]:
     """
     missing = [axis for axis in "xyz" if axis not in names]
     if missing:
-        raise ScanFileError(f"its points have no {' and no '.join(missing)}")
+        raise ScanFileError(f"its points have no {' and no '.join(missing)}", EXPORT)
     return tuple(name for name in names if not name.startswith("*"))
 
 
@@ -221,12 +264,13 @@ class _Stream:
     room: int
     member: str | None = None
 
-    def records(self, path: Path, points: int, stack: ExitStack) -> Iterator[NDArray[Any]]:
+    def records(self, path: Path, points: int, stack: ExitStack, begin: int) -> Iterator[NDArray[Any]]:
         """Yield the records of the points part by part, as structured arrays of shape (n,).
 
         Args:
             path: The file.
             points: Number of points by the header. If the file has fewer, only whole records are yielded.
+            begin: The first point that is read.
             stack: Stack on which the file is opened; the caller closes it.
 
         Raises:
@@ -238,8 +282,9 @@ class _Stream:
             file = stack.enter_context(path.open("rb"))
         else:
             file = stack.enter_context(stack.enter_context(zipfile.ZipFile(path)).open(self.member))
-        file.seek(self.start)
         step = self.dtype.itemsize
+        file.seek(self.start + begin * step)
+        points -= begin
         rows = max(1, min(PART, (16 << 20) // step))
         while points > 0:
             block = file.read(min(rows, points) * step)
@@ -269,19 +314,20 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
         if points and stream.start + stream.dtype.itemsize > stream.room:
             raise ScanFileError("it ends before its first point")
 
-    def read() -> Iterator[Columns]:
+    def read(begin: int = 0) -> Iterator[Columns]:
         """Yield the points in parts, see PointTable; OSError or _DAMAGE if they cannot be read."""
         with ExitStack() as stack:
-            for records in zip(*(s.records(path, points, stack) for s in streams), strict=False):
+            for records in zip(*(s.records(path, points, stack, begin) for s in streams), strict=False):
                 n = min(map(len, records))
                 columns = {name: part[name][:n] for part in records for name in part.dtype.names or ()}
                 yield {name: columns[name] for name in usable}
 
-    return PointTable(kind, points, usable, read)
+    starts = (0,) if any(stream.member is not None for stream in streams) else ()
+    return PointTable(kind, points, usable, read, starts=starts)
 
 
 def _text_table(
-    path: Path, kind: str, points: int, dtype: np.dtype[Any], start: int, skipped: int = 0
+    path: Path, kind: str, points: int, dtype: np.dtype[Any], start: int, skipped: int = 0, more: bool = False
 ) -> PointTable:
     """Return the table of lines of text. Damaged lines are left out of its parts; these raise ScanFileError
     if no line is valid.
@@ -293,6 +339,7 @@ def _text_table(
         dtype: Types of the numbers of a point; a field of several values has its count as shape.
         start: Offset of the first byte after the header.
         skipped: Number of lines before the points.
+        more: Whether a line may have further numbers, as those of a list.
 
     Raises:
         ScanFileError: x, y or z is missing, sizes are too large, or the file is too short.
@@ -305,26 +352,27 @@ def _text_table(
     if points and start + skipped + 2 * sum(counts) > path.stat().st_size + 1:
         raise ScanFileError("it ends before its first point")
 
-    def read() -> Iterator[Columns]:
-        """Yield the points in parts, see PointTable; damaged lines are left out.
+    def read(begin: int = 0) -> Iterator[Columns]:
+        """Yield all points in parts, see PointTable; damaged lines are left out.
 
         Raises:
             ScanFileError: There should be points, and no line is valid.
             OSError: It cannot be read.
         """
+        del begin  # see `starts`
         with path.open("rb") as file:
             file.seek(start)
             for _ in range(skipped):
                 file.readline()
-            begin, rows = file.tell(), None
-            for rows in read_rows(file, sum(counts), points):
+            at, rows = file.tell(), None
+            for rows in read_rows(file, sum(counts), points, more=more):
                 yield {name: _as_type(rows[:, first[name]], dtype[name]) for name in usable}
             if rows is None and points:
-                file.seek(begin)
+                file.seek(at)
                 numbers = len(next((words for line in file if (words := line.split())), []))
                 raise ScanFileError(f"its rows have {numbers} numbers, its header names {sum(counts)}")
 
-    return PointTable(kind, points, usable, read)
+    return PointTable(kind, points, usable, read, starts=(0,))
 
 
 def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
@@ -352,26 +400,28 @@ def _open_pcd(path: Path, head: bytes) -> PointTable:
             more than WHOLE_LIMIT bytes.
         OSError: The file cannot be read.
     """
-    dtype, points, data, start = _pcd_header(head)
+    dtype, points, data, start, height, view = _pcd_header(head)
     kind = f"PCD {data}"
     if data == "ascii":
-        return _text_table(path, kind, points, dtype, start)
+        return replace(_text_table(path, kind, points, dtype, start), view=view, height=height)
     if data == "binary":
-        return _binary_table(path, kind, points, [_Stream(start, dtype, path.stat().st_size)])
+        table = _binary_table(path, kind, points, [_Stream(start, dtype, path.stat().st_size)])
+        return replace(table, view=view, height=height)
     usable = _usable(list(dtype.names or ()))
     if points * dtype.itemsize > WHOLE_LIMIT:
-        raise ScanFileError("its packed data is too large; write it as binary")
+        raise ScanFileError("its packed data is too large", "Write it as DATA binary")
 
-    def read() -> Iterator[Columns]:
+    def read(begin: int = 0) -> Iterator[Columns]:
         """Yield the points as one part. The data has one field after the other, each with all points.
 
         Raises:
             ScanFileError: The packed data is missing, cut, or of another size than in the header.
             OSError: It cannot be read.
         """
+        del begin
         with path.open("rb") as file:
             file.seek(start)
-            body = file.read(WHOLE_LIMIT)
+            body = file.read(min(WHOLE_LIMIT, path.stat().st_size))  # read() takes memory for all it may
         if len(body) < 8:
             raise ScanFileError("its packed data is missing")
         packed, size = struct.unpack_from("<II", body)
@@ -380,15 +430,18 @@ def _open_pcd(path: Path, head: bytes) -> PointTable:
         raw = lzf_decompress(memoryview(body)[8 : 8 + packed], size)
         lengths = [dtype[name].itemsize * points for name in dtype.names or ()]
         fields = dict(zip(dtype.names or (), np.split(raw, np.cumsum(lengths)[:-1]), strict=True))
-        yield {name: fields[name].view(dtype[name]) for name in usable}
+        columns = {name: fields[name].view(dtype[name]) for name in usable}
+        for first in range(0, points, PART):
+            yield {name: column[first : first + PART] for name, column in columns.items()}
 
-    return PointTable(kind, points, usable, read)
+    return PointTable(kind, points, usable, read, starts=(0,), view=view, height=height)
 
 
-def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int]:
+def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int, int, Pose3 | None]:
     """Return the type of a point, the number of points, the kind of the data ("ascii", "binary" or
-    "binary_compressed"), and the length of the header [bytes]. A field of several values has its count as
-    shape, and a name that is not used.
+    "binary_compressed"), the length of the header [bytes], the rows of an organised cloud, and the pose of
+    the sensor (None for the identity or a damaged one). A field of several values has its count as shape, and
+    a name that is not used.
 
     Raises:
         ScanFileError: The bytes are not a header of a PCD file, or the header contradicts itself.
@@ -422,13 +475,25 @@ def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int]:
     names = _column_names(fields)
     for axis in "xyz":
         column = names.index(axis) if axis in names else -1
-        if column < 0 or not types[column].startswith("<f") or counts[column] != 1:
-            raise ScanFileError(f"it has no field {axis} of floating numbers")
+        if column < 0 or counts[column] != 1:
+            raise ScanFileError(f"it has no field {axis}", EXPORT)
     parts = [
         (name, kind) if count == 1 else (f"*{name}", kind, (count,))
         for name, kind, count in zip(names, types, counts, strict=True)
     ]
-    return np.dtype(parts), points, data, at
+    return np.dtype(parts), points, data, at, height, _view(entries.get("VIEWPOINT", []))
+
+
+def _view(words: list[str]) -> Pose3 | None:
+    """Return the pose of the words x y z qw qx qy qz; None for the identity and for other words."""
+    try:
+        numbers = np.array([float(word) for word in words], np.float64)
+        if numbers.shape != (7,) or not (np.abs(numbers) < COORDINATE_LIMIT).all():
+            return None
+        pose = Pose3.from_quaternion(numbers[:3], numbers[3:])
+    except ValueError:
+        return None
+    return None if np.allclose(pose.t, 0.0) and np.allclose(pose.R, np.eye(3)) else pose
 
 
 def _whole_number(word: str) -> int:
@@ -507,13 +572,35 @@ _PLY_TYPES = {
 _PLY_ORDER = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-#: An element of the header: its name, count, and properties (name, type); a list has the type "".
-_PlyElement = tuple[str, int, list[tuple[str, str]]]
+@dataclass(frozen=True, slots=True)
+class _PlyElement:
+    """An element of the header.
+
+    Attributes:
+        name: Name in lower case.
+        count: Number of its records.
+        properties: Name, type of a number, and type of the count of a list ("" for a single number) of each
+            property; types as for NumPy, without byte order.
+    """
+
+    name: str
+    count: int
+    properties: list[tuple[str, str, str]]
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether records have lists, and so different lengths."""
+        return any(count for _, _, count in self.properties)
+
+    @property
+    def least(self) -> int:
+        """Smallest length of a record, with empty lists [bytes]."""
+        return sum(np.dtype(count or kind).itemsize for _, kind, count in self.properties)
 
 
 def _open_ply(path: Path, head: bytes) -> PointTable:
     """Return the table of the first element "vertex", "point" or "points" of a PLY file. Its points are read
-    later.
+    later; lists are skipped.
 
     Args:
         path: The file.
@@ -521,26 +608,164 @@ def _open_ply(path: Path, head: bytes) -> PointTable:
 
     Raises:
         ScanFileError: The header is damaged or promises too many points, there is no such element, it has no
-            x, y or z, or it has list properties, or the file ends before its first point. In a binary file,
-            also if an element before it has list properties.
+            x, y or z, or the file ends before its first point. In a text file, also if a list stands before
+            x, y and z.
         OSError: The size of a binary file cannot be read.
     """
     order, elements, start = _ply_header(head)
-    place = next((k for k, e in enumerate(elements) if e[0] in ("vertex", "point", "points")), None)
+    place = next((k for k, e in enumerate(elements) if e.name in ("vertex", "point", "points")), None)
     if place is None:
-        raise ScanFileError("the PLY file has no vertices")
-    if not all(kind for _, _, fields in elements[0 if order else place : place + 1] for _, kind in fields):
-        raise ScanFileError("the PLY file has lists of varying length before its last vertex")
-    types = [
-        np.dtype([(f"*{k}", (order or "<") + kind) for k, (_, kind) in enumerate(fields) if kind])
-        for _, _, fields in elements[: place + 1]
-    ]
-    counts, dtype = [count for _, count, _ in elements[: place + 1]], types[place]
-    dtype.names = tuple(_column_names([name for name, _ in elements[place][2]]))
+        raise ScanFileError("the PLY file has no vertices", EXPORT)
+    before, vertex = elements[:place], elements[place]
     if not order:
-        return _text_table(path, "PLY text", counts[place], dtype, start, sum(counts[:place]))
-    start += sum(count * kind.itemsize for count, kind in zip(counts[:place], types, strict=False))
-    return _binary_table(path, "PLY binary", counts[place], [_Stream(start, dtype, path.stat().st_size)])
+        return _ply_text(path, vertex, start, sum(element.count for element in before))
+    if any(element.has_lists for element in (*before, vertex)):
+        return _ply_with_lists(path, order, before, vertex, start)
+    names = _column_names([name for name, _, _ in vertex.properties])
+    dtype = np.dtype(
+        [(name, order + kind) for name, (_, kind, _) in zip(names, vertex.properties, strict=True)]
+    )
+    start += sum(element.count * element.least for element in before)
+    return _binary_table(path, "PLY binary", vertex.count, [_Stream(start, dtype, path.stat().st_size)])
+
+
+def _ply_text(path: Path, vertex: _PlyElement, start: int, skipped: int) -> PointTable:
+    """Return the table of a PLY file in text, of whose vertices the numbers before the first list are read.
+
+    Args:
+        path: The file.
+        vertex: The element of the points.
+        start: Length of the header [bytes].
+        skipped: Number of lines before the points.
+
+    Raises:
+        ScanFileError: x, y or z is missing or stands after a list, or the file is too short.
+    """
+    fixed = list(takewhile(lambda each: not each[2], vertex.properties))
+    names = _column_names([name for name, _, _ in fixed])
+    if vertex.has_lists and not set("xyz") <= set(names):
+        raise ScanFileError("its points have a list before x, y and z", EXPORT)
+    dtype = np.dtype([(name, "<" + kind) for name, (_, kind, _) in zip(names, fixed, strict=True)])
+    return _text_table(path, "PLY text", vertex.count, dtype, start, skipped, more=vertex.has_lists)
+
+
+def _ply_with_lists(
+    path: Path, order: str, before: list[_PlyElement], vertex: _PlyElement, start: int
+) -> PointTable:
+    """Return the table of a binary PLY file with lists in or before its vertices.
+
+    Args:
+        path: The file.
+        order: Byte order, "<" or ">".
+        before: Elements before the vertices.
+        vertex: The element of the points.
+        start: Length of the header [bytes].
+
+    Raises:
+        ScanFileError: x, y or z is missing, sizes are too large, or the file is too short.
+        OSError: The size of the file cannot be read.
+    """
+    names = _column_names([name if not count else "" for name, _, count in vertex.properties])
+    usable = _usable(names)
+    _check_size(vertex.count, vertex.least)
+    if (
+        start + sum(e.count * e.least for e in before) + vertex.least * bool(vertex.count)
+        > path.stat().st_size
+    ):
+        raise ScanFileError("it ends before its first point")
+
+    def read(begin: int = 0) -> Iterator[Columns]:
+        """Yield the points in parts, see PointTable; ScanFileError at a list that is too long."""
+        del begin
+        with path.open("rb") as file:
+            file.seek(start)
+            for element in before:
+                if element.has_lists:
+                    for _ in _walk(file, element, order):
+                        pass
+                else:
+                    file.seek(element.count * element.least, io.SEEK_CUR)
+            for block, at in _walk(file, vertex, order):
+                columns = {}
+                for k, (name, (_, kind, _)) in enumerate(zip(names, vertex.properties, strict=True)):
+                    if name in usable:
+                        dtype = np.dtype(order + kind)
+                        places = at[:, k, None] + np.arange(dtype.itemsize)
+                        columns[name] = block[places].view(dtype)[:, 0]
+                yield columns
+
+    return PointTable("PLY binary", vertex.count, usable, read, starts=(0,))
+
+
+_WALKED = 4 << 20  # bytes whose records are found at once
+
+
+def _walk(
+    file: IO[bytes], element: _PlyElement, order: str
+) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.int64]]]:
+    """Yield blocks of whole records of an element, and the place of each property in the block, shape (N,
+    properties) [bytes]; the file is then behind the element, or at its end.
+
+    Raises:
+        ScanFileError: A record is longer than STEP_LIMIT.
+    """
+    sizes = np.array([np.dtype(kind).itemsize for _, kind, _ in element.properties], np.int64)
+    counts = np.array([np.dtype(c).itemsize if c else 0 for _, _, c in element.properties], np.int64)
+    left, at = element.count, file.tell()
+    while left > 0:
+        file.seek(at)
+        block = np.frombuffer(file.read(_WALKED), np.uint8)
+        rows = min(left, len(block) // max(element.least, 1), _WALKED // len(sizes))
+        places = np.empty((rows, len(sizes)), np.int64)
+        found, end = _find_records(block, sizes, counts, order == ">", places)
+        if not found:
+            if len(block) > STEP_LIMIT:
+                raise ScanFileError("a list of it is too long")
+            return
+        yield block, places[:found]
+        left, at = left - found, at + end
+    file.seek(at)
+
+
+@compiled
+def _find_records(
+    block: NDArray[np.uint8],
+    sizes: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    is_big: bool,
+    places: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Find records of varying length.
+
+    Args:
+        block: Bytes that begin with a record.
+        sizes: Size of a number of each property [bytes].
+        counts: Size of the count of each property that is a list [bytes]; 0 for a single number.
+        is_big: Whether counts are big endian.
+        places: Filled with the place of each property of each whole record [bytes].
+
+    Returns:
+        Number of whole records, at most that of the rows of `places`, and the end of the last one.
+    """
+    end = 0
+    for row in range(len(places)):
+        at = end
+        for k in range(len(sizes)):
+            places[row, k] = at
+            number = 1
+            if counts[k]:
+                if at + counts[k] > len(block):
+                    return row, end
+                number = 0
+                for byte in range(counts[k]):
+                    shift = counts[k] - 1 - byte if is_big else byte
+                    number += int(block[at + byte]) << (8 * shift)
+                at += counts[k]
+            at += number * sizes[k]
+            if at > len(block) or at < 0:
+                return row, end
+        end = at
+    return len(places), end
 
 
 def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
@@ -565,11 +790,11 @@ def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
                 case ["format", form, *_]:
                     order = _PLY_ORDER[form]
                 case ["element", name, number]:
-                    elements.append((name.lower(), _whole_number(number), []))
-                case ["property", "list", _, _, name]:
-                    elements[-1][2].append((name, ""))
+                    elements.append(_PlyElement(name.lower(), _whole_number(number), []))
+                case ["property", "list", count, kind, name] if not _PLY_TYPES[count].startswith("f"):
+                    elements[-1].properties.append((name, _PLY_TYPES[kind], _PLY_TYPES[count]))
                 case ["property", kind, name]:
-                    elements[-1][2].append((name, _PLY_TYPES[kind]))
+                    elements[-1].properties.append((name, _PLY_TYPES[kind], ""))
                 case ["property" | "element", *_]:
                     raise ScanFileError("the header of the PLY file is damaged")
         except (KeyError, IndexError, ValueError):
@@ -619,7 +844,7 @@ class _NumpyArray:
             fields = dict(self.dtype.fields or {})
             kinds = [fields[name][0] for name in self.dtype.names]
             if not all(_is_number(kind) or kind.kind in "VSU" for kind in kinds):
-                raise ScanFileError(f"it holds {form}; it must be numbers")
+                raise ScanFileError(f"it holds {form}; it must be numbers", ARRAY)
             names = _column_names(
                 [n if _is_number(k) else "" for n, k in zip(self.dtype.names, kinds, strict=True)]
             )
@@ -628,7 +853,8 @@ class _NumpyArray:
             return [_Stream(self.start, np.dtype(record), self.room, self.member)]  # type: ignore[call-overload]
         if len(self.shape) != 2 or not _is_number(self.dtype) or not 3 <= self.shape[1] <= _MOST_FIELDS:
             raise ScanFileError(
-                f"it holds {form}; it must be (N, 3) numbers or more columns, or have fields x, y and z"
+                f"it holds {form}; it must be (N, 3) numbers or more columns, or have fields x, y and z",
+                ARRAY,
             )
         # Four or five columns are those of KITTI and similar sets; six are x, y, z and a colour.
         known = ["x", "y", "z", *(["intensity"] if self.shape[1] in (4, 5) else [])]
@@ -680,7 +906,7 @@ def _open_npz(path: Path) -> PointTable:
         return _binary_table(
             path, "NumPy .npz, its arrays x, y and z", next(iter(columns.values())).shape[0], streams
         )
-    raise ScanFileError(f"no array of it holds points; {reason}")
+    raise ScanFileError(f"no array of it holds points; {reason}", ARRAY)
 
 
 def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
@@ -704,7 +930,7 @@ def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
     except _HEADER_DAMAGE as error:
         raise ScanFileError(f"the header of the array is damaged: {error}"[:160]) from None
     if dtype.hasobject:
-        raise ScanFileError("an array of Python objects is not read, because it could run code")
+        raise ScanFileError("an array of Python objects is not read, because it could run code", ARRAY)
     if not shape or not all(0 <= n <= MOST_POINTS for n in shape) or dtype.subdtype:
         raise ScanFileError(f"the header of the array promises the shape {shape}"[:120])
     return _NumpyArray(member, head.tell(), size, tuple(shape), dtype, fortran)

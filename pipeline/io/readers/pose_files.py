@@ -331,7 +331,7 @@ def parse_numbers(text: bytes) -> tuple[Float, int]:
     return np.concatenate(parts), left
 
 
-def parse_table(text: bytes, columns: int) -> tuple[Float, int]:
+def parse_table(text: bytes, columns: int, *, more: bool = False) -> tuple[Float, int]:
     """Parse lines of numbers separated by blanks; a text without lines gives shape (0, columns).
 
     Empty lines are skipped. A line with another number of words, or with a word that is not a number, is
@@ -340,6 +340,7 @@ def parse_table(text: bytes, columns: int) -> tuple[Float, int]:
     Args:
         text: Text in ASCII.
         columns: Numbers per line.
+        more: Whether a line may have further numbers, which are left out.
 
     Returns:
         The numbers, float64, shape (rows, columns), and the number of damaged lines.
@@ -347,17 +348,20 @@ def parse_table(text: bytes, columns: int) -> tuple[Float, int]:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "loadtxt: input contained no data")
-            table = np.loadtxt(io.BytesIO(text), comments=None, ndmin=2, encoding="latin1")
+            wanted = range(columns) if more else None
+            table = np.loadtxt(io.BytesIO(text), comments=None, ndmin=2, encoding="latin1", usecols=wanted)
         if table.shape[1] == columns and table.size:
             return table, 0
     except ValueError:
         pass  # at least one line is damaged: find out which
     lines = [words for line in text.split(b"\n") if (words := line.split())]
+    if more:
+        lines = [words[:columns] for words in lines]
     rows = [row for words in lines if len(words) == columns and (row := _numbers(words)) is not None]
     return np.array(rows, np.float64).reshape(-1, columns), len(lines) - len(rows)
 
 
-def read_rows(file: IO[bytes], columns: int, lines: int) -> Iterator[Float]:
+def read_rows(file: IO[bytes], columns: int, lines: int, *, more: bool = False) -> Iterator[Float]:
     """Yield the numbers of the next lines of a file part by part, each of shape (N, columns), N >= 1.
 
     Empty lines are skipped, and damaged lines are left out; see `parse_table`. A line of more than
@@ -367,6 +371,7 @@ def read_rows(file: IO[bytes], columns: int, lines: int) -> Iterator[Float]:
         file: Open at the beginning of the first line.
         columns: Numbers per line.
         lines: Maximum number of lines that are not empty, including damaged ones.
+        more: Whether a line may have further numbers, which are left out.
     """
     left = lines
     while left > 0:
@@ -375,7 +380,7 @@ def read_rows(file: IO[bytes], columns: int, lines: int) -> Iterator[Float]:
         if not block:
             return
         left -= len(block)
-        rows, _ = parse_table(b"".join(block), columns)
+        rows, _ = parse_table(b"".join(block), columns, more=more)
         if len(rows):
             yield rows
 

@@ -64,9 +64,9 @@ class Db3File(Container):
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MESSAGE_LIMIT)
             self._database.execute("PRAGMA trusted_schema = OFF")
             self._check_tables()
-            index = self._read_index()
-            self.clock_steps = shift_after_steps(index)
-            self._set_index(self._read_channels(), index)
+            index, channels = self._read_index(), self._read_channels()
+            self.clock_steps = shift_after_steps(index, {channel.number: channel for channel in channels})
+            self._set_index(channels, index)
         except (sqlite3.Error, OverflowError, UnicodeDecodeError, ValueError, TypeError) as error:
             self.close()
             raise damaged(f"the database cannot be read: {error}", path) from error
@@ -102,7 +102,11 @@ class Db3File(Container):
             " AND NOT EXISTS (SELECT 1 FROM pragma_table_xinfo(t.name) WHERE hidden)"
         )
         if not {"messages", "topics"} <= {name for (name,) in found}:
-            raise damaged("the database holds no tables of messages and topics", self._path)
+            raise damaged(
+                "the database holds no tables of messages and topics",
+                self._path,
+                "It is of another program: name the .db3 of a ROS 2 recorder.",
+            )
 
     def _read_index(self) -> Int:
         """Return topic, time [ns] and row of all messages, int64, shape (N, 3). Damaged ones are left out
@@ -208,7 +212,17 @@ class BagFolder(Container):
             index.append(part.index + np.array([_STRIDE * number, 0, 0]))
             for reason, count in part.damage.items():
                 count_loss(self.damage, reason, count)
-        self._set_index(channels, np.concatenate(index))
+        # The clock may be set between two files, where no part sees a step; a part is in the order of time.
+        table = np.concatenate(index)
+        self.clock_steps += shift_after_steps(table, {channel.number: channel for channel in channels})
+        ends = np.cumsum([len(part) for part in index]).tolist()
+        self._shifts_ns = [
+            int((table[end - len(rows) : end, 1] - rows[:, 1]).max(initial=0))
+            for rows, end in zip(index, ends, strict=True)
+        ]
+        for rows, end, shift_ns in zip(index, ends, self._shifts_ns, strict=True):
+            table[end - len(rows) : end, 1] = rows[:, 1] + shift_ns
+        self._set_index(channels, table)
 
     def attachment(self, name: str, limit: int) -> bytes | None:
         """Return the bytes of an attachment of the first file that has one of this name; None if none has.
@@ -228,8 +242,9 @@ class BagFolder(Container):
         """Return the message at the location `place` in the file to which the channel belongs; None if it
         cannot be read. SourceError if that file cannot be read."""
         part, own = divmod(number, _STRIDE)
-        message = self._parts[part]._message(own, log_ns, place)
-        return None if message is None else replace(message, channel=number)
+        shift_ns = self._shifts_ns[part]
+        message = self._parts[part]._message(own, log_ns - shift_ns, place)
+        return None if message is None else replace(message, channel=number, log_ns=message.log_ns + shift_ns)
 
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -256,7 +271,9 @@ class BagFile(ChunkedFile):
             SourceError: The file is not a bag of version 2.0, or is encrypted.
         """
         if self._read(0, len(MAGIC)) != MAGIC:
-            raise damaged("not a ROS 1 bag of version 2.0", self._path)
+            raise damaged(
+                "not a ROS 1 bag of version 2.0", self._path, "Convert an older one with `rosbag fix`."
+            )
         at, strange = len(MAGIC), 0
         while at + 8 <= end:
             (header_size,) = LENGTH.unpack(self._read(at, 4))
@@ -295,7 +312,7 @@ class BagFile(ChunkedFile):
         """
         opcode = header[b"op"][0] if header[b"op"] else 0
         if opcode == BAG_HEADER and header.get(b"encryptor"):
-            raise damaged("the bag is encrypted", self._path)
+            raise damaged("the bag is encrypted", self._path, "Decrypt it with `rosbag decrypt`.")
         if opcode == CONNECTION:
             self._define(header, self._read(body, min(length, HEADER_LIMIT)))
         elif opcode == CHUNK:

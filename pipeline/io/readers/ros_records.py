@@ -9,18 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers import hesai
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.livox import CUSTOM_TYPES, CustomMsg, decode_custom
 from pipeline.io.readers.measured_poses import Fix, GnssFrame, NoPoseError, OtherFrame, OtherPose
-from pipeline.io.readers.message_time import SECOND_NS
+from pipeline.io.readers.message_time import SECOND_NS, header_stamp
+from pipeline.io.readers.point_times import (
+    LONGEST_NS,
+    PointTimes,
+    TimedScan,
+    decide_point_times,
+    time_fields,
+)
 from pipeline.io.readers.scan_columns import (
-    OFFSET_LIMIT_NS,
     POINT_LIMIT,
     REFLECTANCE,
+    RETURNED,
     RING,
-    TIME,
     clean_scan,
+    has_times,
     scan_of,
+    timed_scan,
 )
 from pipeline.io.readers.topics import (
     IMU,
@@ -31,8 +41,8 @@ from pipeline.io.readers.topics import (
     decode,
 )
 from pipeline.io.readers.transforms import TransformTree, frame_name, pose_of
-from pipeline.io.readers.velodyne import PacketDecoder, is_data_packet
-from pipeline.types.records import Imu, Odometry, Record, Scan
+from pipeline.io.readers.velodyne import SENSORS, PacketDecoder, is_data_packet
+from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor
 
 if TYPE_CHECKING:
     from rosbags.typesys.stores import ros2_jazzy as ros2
@@ -46,20 +56,32 @@ class LayoutError(Exception):
     """The header of a cloud or laser scan contradicts itself or its data."""
 
 
-def decode_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2, stamp_ns: int) -> Scan:
-    """Decode a PointCloud2 message of any layout; `stamp_ns` is the time of the scan [ns].
+def decode_cloud(
+    cloud: ros2.sensor_msgs__msg__PointCloud2,
+    stamp_ns: int,
+    times: PointTimes | None = None,
+    header_ns: int | None = None,
+) -> Scan:
+    """Decode a PointCloud2 message of any layout. Points that are not valid returns are left out, see
+    `clean_scan`.
 
-    The time of a point is read from a field named t, time, timestamp, time_offset or offset_time: integers
-    are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit inferred from
-    their size. See `point_offsets`; if one time is farther than 2 s from the stamp, no times are used. Points
-    that are not valid returns are left out, see `clean_scan`.
+    Args:
+        cloud: The message.
+        stamp_ns: Time of the scan [ns].
+        times: How times of points are read; None for scans without times.
+        header_ns: Stamp in the header [ns], if it differs from `stamp_ns`.
 
     Raises:
         LayoutError: Width, height, steps, fields and length of the data do not fit together, x, y or z is
             missing or not a floating number, or there are more than POINT_LIMIT points.
     """
+    return scan_of(stamp_ns, _columns(cloud), times, header_ns)
+
+
+def _columns(cloud: ros2.sensor_msgs__msg__PointCloud2) -> dict[str, NDArray[np.generic]]:
+    """Return a dict from names to columns of a cloud, shape (N,). LayoutError as in `decode_cloud`."""
     table = _table(cloud)
-    return scan_of(stamp_ns, {name: table[name] for name in table.dtype.names or ()})
+    return {name: table[name] for name in table.dtype.names or ()}
 
 
 def _table(cloud: ros2.sensor_msgs__msg__PointCloud2) -> NDArray[np.void]:
@@ -96,11 +118,11 @@ def _dtype(cloud: ros2.sensor_msgs__msg__PointCloud2, step: int) -> np.dtype[np.
         LayoutError: A field is outside of the point, or x, y or z is missing or not a floating number.
     """
     order = ">" if cloud.is_bigendian else "<"
+    used = {*"xyz", *REFLECTANCE, *RING, *RETURNED, *time_fields([str(field.name) for field in cloud.fields])}
     names, formats, offsets = [], [], []
     for field in cloud.fields:
         name, offset, count = str(field.name), int(field.offset), int(field.count)
-        known = name in (*"xyz", *REFLECTANCE, *RING, *TIME)
-        if not known or name in names or int(field.datatype) not in TYPES:
+        if name not in used or name in names or int(field.datatype) not in TYPES:
             continue
         code = TYPES[int(field.datatype)]
         if offset + int(code[1]) * max(count, 1) > step:
@@ -140,7 +162,7 @@ def decode_laser_scan(laser: ros2.sensor_msgs__msg__LaserScan, stamp_ns: int) ->
     far, angle = ranges[seen], angle[seen]
     points = np.stack([far * np.cos(angle), far * np.sin(angle), np.zeros(len(far))], axis=1)
     each_ns = float(laser.time_increment) * 1e9
-    timed = 0.0 < each_ns * len(ranges) < OFFSET_LIMIT_NS
+    timed = 0.0 < each_ns * len(ranges) < 2 * LONGEST_NS
     strength = laser.intensities if len(laser.intensities) == len(ranges) else None
     return clean_scan(
         stamp_ns,
@@ -150,6 +172,17 @@ def decode_laser_scan(laser: ros2.sensor_msgs__msg__LaserScan, stamp_ns: int) ->
         offset_ns=np.rint(each_ns * np.flatnonzero(seen)).astype(np.int64) if timed else None,
         dropped=len(ranges) - len(points),
     )
+
+
+def _columns_of_custom(custom: CustomMsg, header_ns: int) -> dict[str, NDArray[np.generic]]:
+    """Return a dict from names to columns of a Livox CustomMsg, shape (N,). The times of the points are after
+    its stamp: by its time base if this is by the clock of the stamp (within 2 s), else the time base is taken
+    as the stamp, `header_ns` [ns]."""
+    columns = {name: custom.points[name] for name in custom.points.dtype.names or ()}
+    late_ns = custom.timebase_ns - header_ns
+    if abs(late_ns) < 2 * LONGEST_NS:
+        columns["offset_time"] = columns["offset_time"].astype(np.int64) + late_ns
+    return columns
 
 
 _NAMES = {ODOMETRY: "odometry messages", IMU: "IMU messages", NAV_SAT_FIX: "GNSS messages"}
@@ -168,6 +201,8 @@ class RecordDecoder:
             OtherFrame. Readings of a role that is missing are not used.
         poses: Numbers of the channels with poses of another SLAM.
         levels: Whether the orientations of the IMU are used.
+        times: Dict from frames to how the times of the points of their clouds are read; None for no times.
+            That of a new frame is decided by its first cloud.
     """
 
     def __init__(self, channels: Mapping[int, Channel], tree: TransformTree) -> None:
@@ -178,6 +213,7 @@ class RecordDecoder:
         self.frames: dict[str, GnssFrame | OtherFrame] = {}
         self.poses = frozenset[int]()
         self.levels = True
+        self.times: dict[str, PointTimes | None] = {}
 
     def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
         """Return the record in a message; None if it cannot be used.
@@ -213,34 +249,96 @@ class RecordDecoder:
         count_loss(losses, "scans without points")
         return None
 
-    def scan(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> tuple[Scan, str, int]:
-        """Return a scan, which may have no points, the name of its frame, and the product number of the
-        sensor (0 if unknown).
+    def scan(
+        self, message: Message, stamp_ns: int, losses: dict[str, int]
+    ) -> tuple[Scan, str, Sensor | None]:
+        """Return a scan, which may have no points, the name of its frame, and the sensor except for its range
+        sigma (None if unknown).
 
         Args:
-            message: PointCloud2, LaserScan or VelodyneScan.
+            message: PointCloud2, LaserScan, CustomMsg, or packets of Velodyne or Hesai.
             stamp_ns: Time of the scan [ns].
             losses: Dict from reasons to numbers; the number of packets that are not data packets is added in
                 place.
 
         Raises:
-            Exception: Of many kinds, when the message is damaged, or a VelodyneScan has no data packet.
+            SourceError: The packets are of a model that cannot be decoded.
+            Exception: Of many kinds, when the message is damaged, or has no data packet.
         """
         msgtype = self._channels[message.channel].msgtype
         if msgtype == LASER_SCAN:
             laser: ros2.sensor_msgs__msg__LaserScan = self.message(message)
-            return decode_laser_scan(laser, stamp_ns), frame_name(laser.header.frame_id), 0
-        if msgtype == POINT_CLOUD:
-            cloud: ros2.sensor_msgs__msg__PointCloud2 = self.message(message)
-            return decode_cloud(cloud, stamp_ns), frame_name(cloud.header.frame_id), 0
+            return decode_laser_scan(laser, stamp_ns), frame_name(laser.header.frame_id), None
+        if msgtype in (POINT_CLOUD, *CUSTOM_TYPES):
+            frame, columns = self._table(message)
+            return self._timed_scan(message, frame, columns, stamp_ns, losses), frame, None
         decoded = self.message(message)
-        packets = [(_time_ns(p.stamp), p.data.tobytes()) for p in decoded.packets]
-        good = [packet for packet in packets if is_data_packet(packet[1])]
+        frame, shift = frame_name(decoded.header.frame_id), stamp_ns - _time_ns(decoded.header.stamp)
+        of_hesai = msgtype in hesai.SCAN_TYPES
+        packets = [
+            (_time_ns(p.stamp) + shift, (p.data[: p.size] if of_hesai else p.data).tobytes())
+            for p in decoded.packets
+        ]
+        good = [each for each in packets if (hesai.model_of if of_hesai else is_data_packet)(each[1])]
+        if of_hesai and packets and not good:
+            hesai.refuse(packets[0][1])
         if len(good) < len(packets):
             count_loss(losses, "packets that are no data packets", len(packets) - len(good))
-        shift = stamp_ns - _time_ns(decoded.header.stamp)
-        scan = self._packets.decode(stamp_ns, [t + shift for t, _ in good], [p for _, p in good])
-        return scan, frame_name(decoded.header.frame_id), good[0][1][-1]
+        times, data = [stamp for stamp, _ in good], [packet for _, packet in good]
+        if of_hesai:
+            scan, model = hesai.decode_hesai(stamp_ns, times, data)
+            return scan, frame, model.sensor
+        return self._packets.decode(stamp_ns, times, data), frame, SENSORS[data[0][-1]]
+
+    def timed(self, message: Message) -> tuple[str, TimedScan] | None:
+        """Return the frame of a cloud and what its times are decided by; None for another type, or a cloud
+        without valid returns.
+
+        Raises:
+            Exception: Of many kinds, when the message is damaged.
+        """
+        if self._channels[message.channel].msgtype not in (POINT_CLOUD, *CUSTOM_TYPES):
+            return None
+        frame, columns = self._table(message)
+        if not len(scan_of(0, columns).points):
+            return None
+        return frame, timed_scan(self._header_ns(message), columns)
+
+    def _table(self, message: Message) -> tuple[str, dict[str, NDArray[np.generic]]]:
+        """Return the frame and the columns of a cloud or a CustomMsg, shape (N,) each.
+
+        Raises:
+            Exception: Of many kinds, when the message is damaged.
+        """
+        channel = self._channels[message.channel]
+        if channel.msgtype == POINT_CLOUD:
+            cloud: ros2.sensor_msgs__msg__PointCloud2 = self.message(message)
+            return frame_name(cloud.header.frame_id), _columns(cloud)
+        custom = decode_custom(message.payload, channel.encoding)
+        return frame_name(custom.frame), _columns_of_custom(custom, self._header_ns(message))
+
+    def _timed_scan(
+        self,
+        message: Message,
+        frame: str,
+        columns: dict[str, NDArray[np.generic]],
+        stamp_ns: int,
+        losses: dict[str, int],
+    ) -> Scan:
+        """Return the scan of some columns with the times of its points, as decided for its frame; a scan
+        whose times do not fit this is counted in `losses`."""
+        header_ns = self._header_ns(message)
+        if frame not in self.times and len(columns["x"]):
+            self.times[frame], _ = decide_point_times([timed_scan(header_ns, columns)])
+        times = self.times.get(frame)
+        scan = scan_of(stamp_ns, columns, times, header_ns)
+        if times is not None and len(scan.points) and not has_times(scan):
+            count_loss(losses, "scans without usable times of points, which are not de-skewed")
+        return scan
+
+    def _header_ns(self, message: Message) -> int:
+        """Return the stamp in the header of a message [ns]; 0 if it is impossible."""
+        return header_stamp(self._channels[message.channel], message.payload) or 0
 
     def message(self, message: Message) -> Any:  # noqa: ANN401
         """Decode a message as the type of its channel.

@@ -8,7 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.types.records import Float, Float32, Int, Int32, Scan, Sensor
+from pipeline.io.readers.firing_order import FIRING_ORDER, azimuth_step, turn_shares
+from pipeline.io.readers.livox import tag_noise
+from pipeline.io.readers.point_times import PointTimes, TimedScan, time_fields
+from pipeline.types.records import Bool, Float, Float32, Int, Int32, Scan, Sensor
 
 #: Most points of one scan; a 128-ring sensor at 5 Hz gives 480,000.
 POINT_LIMIT = 16_000_000
@@ -43,10 +46,7 @@ def clean_scan(
     """
     with np.errstate(invalid="ignore", over="ignore"):
         xyz = np.ascontiguousarray(points, dtype=np.float32)
-        # Column by column: reducing rows of three is ten times slower.
-        x, y, z = np.abs(xyz.T)
-        reach = np.maximum(np.maximum(x, y), z)
-        keep = (reach > NEAR_LIMIT) & (reach < RANGE_LIMIT)
+        keep = are_returns(xyz)
     refused = int(len(keep) - np.count_nonzero(keep))
     if refused:
         xyz = xyz[keep]
@@ -65,6 +65,16 @@ def clean_scan(
     )
 
 
+def are_returns(points: Float32) -> Bool:
+    """Return which points, float32, shape (N, 3) [m], are valid returns, see `clean_scan`; shape (N,)."""
+    # Column by column: reducing rows of three is ten times slower.
+    with np.errstate(invalid="ignore"):
+        x, y, z = np.abs(points.T)
+        reach = np.maximum(np.maximum(x, y), z)
+        valid: Bool = (reach > NEAR_LIMIT) & (reach < RANGE_LIMIT)
+    return valid
+
+
 def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
     """Return a column as float32, with NaN as 0 and infinite numbers as the largest float32 of their sign;
     None for None. A contiguous float32 column of finite numbers is not copied."""
@@ -81,10 +91,13 @@ def _as_int(values: NDArray[np.generic] | None) -> Int32 | None:
 
 
 REFLECTANCE = ("intensity", "intensities", "reflectivity", "reflectance", "i")
-RING = ("ring", "channel", "laser_id", "line")
-TIME = ("t", "time", "timestamp", "time_offset", "offset_time")
+#: The `line` of a Livox LiDAR is no ring: its elevation changes.
+RING = ("ring", "channel", "laser_id")
+#: Columns of clouds that other odometry writes, which may be de-skewed already; no driver has them.
+PROCESSED = frozenset({"curvature", "normal_x"})
+#: Columns that tell which points are returns: the range of Ouster [mm], 0 for no return, and tags of Livox.
+RETURNED = ("range", "tag")
 RING_LIMIT = 1024
-OFFSET_LIMIT_NS = 2_000_000_000
 
 
 def first_of(
@@ -107,71 +120,95 @@ def is_ring(ring: NDArray[np.generic]) -> bool:
     return int(ring.min()) >= 0 and int(ring.max()) < RING_LIMIT
 
 
-def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
-    """Return the times of points relative to the stamp [ns], shape (N,), or None if they are impossible.
-
-    Integers are nanoseconds after the stamp, or since 1970 if the first one is above 1e15; floating numbers
-    are seconds after the stamp, or times since 1970 in s, ms, us or ns if the largest is above 1e8, 1e11,
-    1e14 or 1e17. If one time is farther than 2 s from the stamp, all are impossible; so is an empty column. A
-    floating number that is not finite counts as the time of the stamp.
-    """
-    if not len(time):
-        return None
-    if time.dtype.kind in "iu":
-        ns = time.astype(np.int64)
-        ns = ns - stamp_ns if abs(int(ns[0])) > 10**15 else ns
-    else:
-        with np.errstate(invalid="ignore"):
-            seconds = time.astype(np.float64)
-        finite = np.isfinite(seconds)
-        if not finite.all():
-            seconds[~finite] = 0.0
-        unit = _unit(float(np.abs(seconds).max()))
-        since = stamp_ns if unit is not None else 0
-        # Subtract the whole second first: a double cannot hold nanoseconds since 1970.
-        whole = since // 1_000_000_000
-        scale = unit or 1.0
-        with np.errstate(over="ignore"):
-            seconds = (seconds - whole / scale) * scale
-            ns = np.clip(seconds * 1e9, -1e18, 1e18).astype(np.int64) - (since - whole * 10**9)
-        ns[~finite] = 0
-    return ns if int(np.abs(ns).max()) <= OFFSET_LIMIT_NS else None
-
-
-def _unit(largest: float) -> float | None:
-    """Return the unit [s] of times since 1970 by the largest magnitude, None if times are relative (up to
-    1e8)."""
-    for limit, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
-        if largest > limit:
-            return unit
-    return None
-
-
-def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
-    """Return a scan of the columns of a table, which are found by their usual names (REFLECTANCE, RING, TIME;
-    the first one that exists), without invalid returns (`clean_scan`). Ring numbers and times that are
-    impossible are left out as a whole.
+def scan_of(
+    stamp_ns: int,
+    columns: Mapping[str, NDArray[np.generic]],
+    times: PointTimes | None = None,
+    header_ns: int | None = None,
+) -> Scan:
+    """Return a scan of the columns of a table, which are found by their usual names (REFLECTANCE, RING; the
+    first one that exists), without invalid returns (`clean_scan`). Ring numbers and times that are impossible
+    are left out as a whole; where a sensor has times, a scan without usable ones has those of its middle.
 
     Args:
         stamp_ns: Time of the scan [ns].
         columns: Dict from names to columns, shape (N,); x, y and z [m] are among them.
+        times: How times of points are read; None for scans without times.
+        header_ns: Stamp in the header of the scan [ns], if it differs from `stamp_ns`.
     """
-    kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
-    with np.errstate(invalid="ignore", over="ignore"):
-        points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)
-    ring, time = first_of(columns, RING), first_of(columns, TIME)
-    return clean_scan(
+    points, keep = _returns_of(columns)
+    ring = first_of(columns, RING)
+    scan = clean_scan(
         stamp_ns,
         points,
         reflectance=first_of(columns, REFLECTANCE),
         ring=ring if ring is not None and is_ring(ring) else None,
-        offset_ns=None if time is None else point_offsets(time, stamp_ns),
     )
+    if times is None or not keep.any():
+        return scan
+    if times.field == FIRING_ORDER:
+        time: NDArray[np.generic] | None = turn_shares(scan.points)
+    else:  # beams without a return often have no time either
+        time = columns[times.field][keep] if times.field in columns else None
+    offset_ns = None if time is None else times.offsets(time, stamp_ns if header_ns is None else header_ns)
+    if offset_ns is None:  # all at the middle of the sweep, which the stamp is not
+        offset_ns = np.full(len(scan.points), (times.low_ns + times.high_ns) // 2)
+    return replace(scan, offset_ns=_as_int(offset_ns))
 
 
+def has_times(scan: Scan) -> bool:
+    """Return whether a scan with points can be de-skewed: its points have different times."""
+    return scan.offset_ns is not None and bool(scan.offset_ns.min() < scan.offset_ns.max())
+
+
+def timed_scan(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> TimedScan:
+    """Return the columns that may have times of points, of the valid returns of a table, and these in their
+    order. A table with one of the columns PROCESSED has no order: it may be de-skewed already.
+
+    Args:
+        stamp_ns: Stamp of the scan [ns].
+        columns: As in `scan_of`.
+    """
+    points, keep = _returns_of(columns)
+    timed = {name: columns[name][keep] for name in time_fields(list(columns))}
+    if not PROCESSED.isdisjoint(columns):
+        return TimedScan(stamp_ns, timed)
+    ring = first_of(columns, RING)
+    ring = ring[keep] if ring is not None and is_ring(ring) else None
+    return TimedScan(stamp_ns, timed, points[keep].astype(np.float32), ring)
+
+
+def _returns_of(columns: Mapping[str, NDArray[np.generic]]) -> tuple[NDArray[np.floating], Bool]:
+    """Return the points of a table, shape (N, 3) [m], and which of them are valid returns, shape (N,)."""
+    kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
+    with np.errstate(invalid="ignore", over="ignore"):
+        points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)
+    void = _no_returns(columns)
+    if void is not None:
+        points[void] = np.nan
+    with np.errstate(over="ignore"):
+        return points, are_returns(points.astype(np.float32, copy=False))
+
+
+def _no_returns(columns: Mapping[str, NDArray[np.generic]]) -> Bool | None:
+    """Return which points are no returns by the columns RETURNED, shape (N,); None without these columns. A
+    driver that moves its cloud to another frame moves points without a return away from the origin."""
+    reach, tag = (columns.get(name) for name in RETURNED)
+    none = np.asarray(reach == 0) if reach is not None and reach.dtype.kind in "iu" else None
+    noise = tag_noise(tag) if tag is not None and tag.dtype.kind in "iu" else None
+    return noise if none is None else none if noise is None else none | noise
+
+
+#: A sensor without rings whose returns are nearer to each other covers the width of a stem by many rows: the
+#: steps of `Sensor` hold [rad]. Real scans of such a sensor have 0.0063.
+_DENSE = 0.007
+#: Largest angle between neighbouring returns [rad]: of a few hundred points all around.
+_SPACING_MOST = 0.1
 #: Fewest points of a ring for its elevation.
 _RING_POINTS = 8
 VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.03, 100.0)
+#: The returns of a VLP-16 are 0.63 degrees apart at 10 Hz, 0.89 at 20 Hz; of a thinned-out scan more [rad].
+_VLP_16_SPACING = float(np.radians(1.1))
 #: Bounds of a measured range sigma [m]: the roughness of bark, which exceeds the noise of a better sensor,
 #: and the accuracy of a VLP-16 by its data sheet, which rough ground may exceed.
 RANGE_SIGMA_LEAST, RANGE_SIGMA_MOST = 0.01, 0.03
@@ -179,6 +216,25 @@ RANGE_SIGMA_LEAST, RANGE_SIGMA_MOST = 0.01, 0.03
 #: surface, with nine degrees of freedom beside the plane.
 _PLACES, _NEIGHBOURS = 1000, 12
 _FEWEST = 100  # points of a scan
+#: Neighbours of one ring lie on a line: their spread across it is less than this share of that along it. It
+#: comes from the distance between laser and origin, which ties the direction of a point to its noise.
+_LINE = 0.1
+
+
+#: Largest median distance of the returns of a scan [m]: LiDARs of ground robots reach 50 to 500 m, and most
+#: of their returns are of the ground within tens of metres.
+FARTHEST_MEDIAN = 400.0
+NO_METRES = (
+    "scans whose coordinates are not in metres, or not those of the sensor: half of the points of the first "
+    "one are farther than 400 m away; let the driver write metres in the frame of the LiDAR"
+)
+
+
+def median_range(scan: Scan) -> float:
+    """Return the median distance of the points of a scan [m]; 0 without points."""
+    if not len(scan.points):
+        return 0.0
+    return float(np.median(np.linalg.norm(scan.points.astype(np.float64), axis=1)))
 
 
 def sensor_of(scan: Scan, known: Sensor | None = None) -> Sensor:
@@ -186,14 +242,44 @@ def sensor_of(scan: Scan, known: Sensor | None = None) -> Sensor:
     the step in azimuth, and the range sigma (`measured_range_sigma`).
 
     If the scan has no ring numbers, it is a VLP-16 if the elevations are those of this sensor, else `rings`
-    is 0. For fewer than 100 points `rings` is 0 too. An unknown azimuth step is that of `Sensor`, an unknown
+    is 0. Both steps of a sensor without rings are the angle between neighbouring returns (`beam_spacing`) if
+    it is above _DENSE; otherwise, and for fewer than 100 points, the azimuth step is that of `Sensor` and the
     ring step 0.
 
     Args:
         scan: The scan.
         known: The sensor, if it is known except for its range sigma.
     """
-    return replace(known or _beams_of(scan), range_sigma=measured_range_sigma(scan))
+    found = replace(known or _beams_of(scan), range_sigma=measured_range_sigma(scan))
+    if known is None and not found.rings and len(scan.points) >= _FEWEST:
+        step = beam_spacing(scan)
+        if step > _DENSE:
+            found = replace(found, azimuth_step=step, ring_step=step)
+    return found
+
+
+def beam_spacing(scan: Scan) -> float:
+    """Return the angle between neighbouring returns [rad]: the square root of the solid angle of a return,
+    which is the median over places all over the scan. The scan has at least 100 points.
+
+    It is 0.9 to 1.1 times the square root of azimuth step times ring step of spinning sensors, 0.38 degrees
+    for 24,000 returns in a cone of 70 degrees, and 1.05 for a Mid-360.
+    """
+    beam, _, near = _neighbours(scan)
+    away: Float = np.linalg.norm(beam[near[:, -1]] - beam[near[:, 0]], axis=1)
+    return float(min(np.sqrt(np.median(np.pi * away**2) / (_NEIGHBOURS - 1)), _SPACING_MOST))
+
+
+def _neighbours(scan: Scan) -> tuple[Float, Float, Int]:
+    """Return the unit direction of each point, shape (N, 3), its range [m], and the rows of the _NEIGHBOURS
+    points that are nearest in direction to each of _PLACES points, the point itself first."""
+    from scipy.spatial import cKDTree
+
+    points = scan.points.astype(np.float64)
+    reach = np.linalg.norm(points, axis=1)
+    beam = points / reach[:, None]
+    places = np.linspace(0, len(points) - 1, min(_PLACES, len(points))).astype(np.int64)
+    return beam, reach, cKDTree(beam).query(beam[places], _NEIGHBOURS)[1]
 
 
 def measured_range_sigma(scan: Scan) -> float:
@@ -201,24 +287,22 @@ def measured_range_sigma(scan: Scan) -> float:
     for fewer than 100 points.
 
     On a plane n p = d, the inverse range of a beam u is linear in u: 1/r = n u / d. This is fitted to the
-    returns of neighbouring beams at places all over the scan, whatever the pattern of the sensor. The
-    residuals show the noise on ground and stems, and more on leaves and at edges, so the lower quartile of
-    the places is taken: 0.87 to 1.09 times the true value in simulated stands, with few or many leaves.
+    returns of neighbouring beams at places all over the scan, whatever the pattern of the sensor; neighbours
+    on one ring determine no more than a line. The residuals show the noise on ground and stems, and more on
+    leaves and at edges, so the lower quartile of the places is taken: 0.87 to 1.09 times the true value in
+    simulated stands, with few or many leaves.
     """
-    from scipy.spatial import cKDTree
-
     if len(scan.points) < _FEWEST:
         return RANGE_SIGMA_MOST
-    points = scan.points.astype(np.float64)
-    reach = np.linalg.norm(points, axis=1)
-    beam = points / reach[:, None]
-    places = np.linspace(0, len(points) - 1, min(_PLACES, len(points))).astype(np.int64)
-    _, near = cKDTree(beam).query(beam[places], _NEIGHBOURS)
+    beam, reach, near = _neighbours(scan)
     inverse = 1.0 / reach[near][:, :, None]
-    space = np.linalg.svd(beam[near], full_matrices=False)[0]
+    space, spread, _ = np.linalg.svd(beam[near], full_matrices=False)
+    known = spread > _LINE * spread[:, 1:2]
+    known[:, :2] = True
+    space = space * known[:, None, :]
     residual = (inverse - space @ (space.transpose(0, 2, 1) @ inverse))[:, :, 0]
-    variance = np.sum(residual**2, axis=1) / (_NEIGHBOURS - 3)
-    sigma = float(np.quantile(np.sqrt(variance) * reach[places] ** 2, 0.25))
+    variance = np.sum(residual**2, axis=1) / (_NEIGHBOURS - known.sum(axis=1))
+    sigma = float(np.quantile(np.sqrt(variance) * reach[near[:, 0]] ** 2, 0.25))
     return float(np.clip(sigma, RANGE_SIGMA_LEAST, RANGE_SIGMA_MOST))
 
 
@@ -226,13 +310,14 @@ def _beams_of(scan: Scan) -> Sensor:
     """Return the sensor of a scan as `sensor_of` does; its range sigma has no meaning."""
     if len(scan.points) < _FEWEST:
         return Sensor()
-    if scan.ring is None:
-        return VLP_16 if _in_steps_of_vlp_16(scan) else Sensor()
+    if scan.ring is None or not _are_rings(scan):
+        is_vlp_16 = _in_steps_of_vlp_16(scan) and beam_spacing(scan) < _VLP_16_SPACING
+        return VLP_16 if is_vlp_16 else Sensor()
     rings = int(scan.ring.max()) + 1
     elevation = _elevations(scan)
     steps = np.abs(np.diff(elevation[np.isfinite(elevation)]))
     ring_step = float(np.median(steps)) if len(steps) else 0.0
-    azimuth_step = _azimuth_step(scan)
+    step = azimuth_step(scan.points, scan.ring)
     name = {
         1: "planar laser",
         16: "16-ring LiDAR",
@@ -240,7 +325,29 @@ def _beams_of(scan: Scan) -> Sensor:
         64: "64-ring LiDAR",
         128: "128-ring LiDAR",
     }
-    return Sensor(name.get(rings, "LiDAR"), rings, ring_step, azimuth_step or Sensor().azimuth_step)
+    return Sensor(name.get(rings, "LiDAR"), rings, ring_step, step or Sensor().azimuth_step)
+
+
+#: A ring has one elevation in each direction, up to the tilt of its cloud [rad]; the coarsest rings are two
+#: degrees apart.
+_RING_SPREAD = float(np.radians(1.5))
+_RING_SECTORS = 180
+
+
+def _are_rings(scan: Scan) -> bool:
+    """Return whether the ring numbers are those of rings: the median standard deviation of the elevation of a
+    ring in a sector of two degrees is below _RING_SPREAD. The lines of a LiDAR with a rosette are not."""
+    points, ring = scan.points.astype(np.float64), np.asarray(scan.ring, np.int64)
+    reach = np.hypot(points[:, 0], points[:, 1])
+    far = reach > 1.0  # nearer, the distance between laser and origin changes the angle
+    elevation = np.arctan2(points[far, 2], reach[far])
+    turn = np.arctan2(points[far, 1], points[far, 0]) / (2.0 * np.pi) + 0.5
+    cell = ring[far] * _RING_SECTORS + np.minimum(turn * _RING_SECTORS, _RING_SECTORS - 1).astype(np.int64)
+    _, cell, count = np.unique(cell, return_inverse=True, return_counts=True)
+    mean = np.bincount(cell, elevation) / np.maximum(count, 1)
+    variance = np.bincount(cell, (elevation - mean[cell]) ** 2) / np.maximum(count, 1)
+    some = count >= 4
+    return not some.any() or float(np.median(np.sqrt(variance[some]))) < _RING_SPREAD
 
 
 def _in_steps_of_vlp_16(scan: Scan) -> bool:
@@ -277,17 +384,3 @@ def _elevations(scan: Scan) -> Float:
         if len(members) >= _RING_POINTS:
             found[number] = np.median(angle[members])
     return found
-
-
-def _azimuth_step(scan: Scan) -> float:
-    """Return the median angle between neighbouring returns of a ring [rad], without equal azimuths and holes;
-    0 for fewer than _RING_POINTS such angles. The scan has ring numbers."""
-    steps = []
-    ring = np.asarray(scan.ring)
-    azimuth = np.arctan2(scan.points[:, 1].astype(np.float64), scan.points[:, 0].astype(np.float64))
-    for number in np.unique(ring):
-        gaps = np.diff(np.sort(azimuth[ring == number]))
-        # Two returns of one shot have the same azimuth; gaps of 2 degrees are holes.
-        steps.append(gaps[(gaps > 2e-4) & (gaps < 0.035)])
-    gaps = np.concatenate(steps) if steps else np.zeros(0)
-    return float(np.median(gaps)) if len(gaps) >= _RING_POINTS else 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,13 +12,27 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import named, recordings_in
+from pipeline.io.readers import folders_of_runs, named, recordings_in
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
+from pipeline.io.readers.cloud_frame import sample_of
+from pipeline.io.readers.cloud_or_scan import form_of
 from pipeline.io.readers.clouds import open_points
-from pipeline.io.readers.point_files import ScanFileError, read_columns
+from pipeline.io.readers.firing_order import FIRING_ORDER
+from pipeline.io.readers.mounting import assumed_mounting
+from pipeline.io.readers.point_files import Columns, ScanFileError, open_rows, open_table, read_columns
+from pipeline.io.readers.point_times import PointTimes, decide_point_times
 from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns
-from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT, clean_scan, scan_of, sensor_of
-from pipeline.types.records import Int, Odometry, Record, Scan, Sensor
+from pipeline.io.readers.scan_columns import (
+    FARTHEST_MEDIAN,
+    NO_METRES,
+    POINT_LIMIT,
+    RANGE_LIMIT,
+    median_range,
+    scan_of,
+    sensor_of,
+    timed_scan,
+)
+from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor
 
 #: Period of scans without times: 10 Hz.
 STEP_NS = 100_000_000
@@ -27,10 +42,12 @@ POSES = ("poses.txt", "poses.tum", "trajectory.txt", "trajectory.tum", "groundtr
 _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
 #: Number of unreadable files at the start after which the folder is refused.
 _TRIES = 20
+#: Distance of a sensor from the origin by which the frame of its points is known [m].
+_DECISIVE = 1.0
 
 T = TypeVar("T")
-#: Reads one file: (path, stamp_ns, losses) -> scan. Raises ScanFileError or OSError.
-Loader = Callable[[Path, int, dict[str, int]], Scan]
+#: Reads one file: (path, stamp_ns, times, losses) -> scan. Raises ScanFileError or OSError.
+Loader = Callable[[Path, int, PointTimes | None, dict[str, int]], Scan]
 
 
 class ScanFolder(FileSource):
@@ -55,7 +72,7 @@ class ScanFolder(FileSource):
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
         """Find the scan files, read the files of times and poses, and load the first scan that can be read.
-        Recordings of other formats in the folder give a warning.
+        Recordings of other formats in the folder, and folders in it that are runs, give a warning.
 
         Raises:
             SourceError: There are no files, or none of the first ones holds a scan.
@@ -64,6 +81,7 @@ class ScanFolder(FileSource):
         super().__init__()
         self._suffix, self._files = _scan_files(path)
         self._kind, self._load, sensor_of_first = FORMATS[self._suffix]
+        self._T_file_lidar: dict[Path, Pose3] = {}
         if not self._files:
             raise SourceError(f"the folder has no {self._suffix} files", where=uri)
         self._warnings: list[str] = []
@@ -73,15 +91,27 @@ class ScanFolder(FileSource):
         if by_time or len(np.unique(numbers)) < len(numbers) or (numbers < 0).any():
             numbers = np.arange(len(numbers), dtype=np.int64)
         folder = self._files[0].parent
-        others = [name for name in recordings_in(folder) if Path(name).suffix.lower() != self._suffix]
+        own = (self._suffix, ".txt", ".csv")
+        others = [name for name in recordings_in(folder) if Path(name).suffix.lower() not in own]
+        others += folders_of_runs(folder)
         if others and not path.is_file():
             self._warnings.append(f"not part of this run are {named(others)}: open each of them by its name")
         places = [] if path.is_file() else [folder, folder.parent]
+        if path.is_file() and options.form == "auto":
+            self._warnings += _form_words(path)
         self._timed = False
         self._stamp = self._read_stamps(places, numbers)
         self._T_base_lidar = options.T_base_lidar or Pose3.identity()
-        self._poses = self._read_poses(places, numbers)
+        self._poses = self._read_poses(places, numbers) or self._read_views()
+        if self._poses is not None:
+            self._find_frame(self._poses)
+        self._times = self._decide_times()
         first = self._first_scan(uri)
+        if median_range(first) > FARTHEST_MEDIAN:
+            count_loss(self._damage, NO_METRES, len(self._files))
+        if options.T_base_lidar is None and self._poses is None:
+            self._T_base_lidar, messages = assumed_mounting(first)
+            self._warnings += messages
         self._description = SourceDescription(
             uri=uri,
             kind=self._kind,
@@ -94,6 +124,7 @@ class ScanFolder(FileSource):
             end_ns=int(self._stamp[-1]),
             digest=digest_of([*self._files, *self._texts]),
             warnings=tuple(self._warnings),
+            has_times=self._timed,
         )
 
     def records(self) -> Iterator[Record]:
@@ -106,7 +137,7 @@ class ScanFolder(FileSource):
             if pose is not None:
                 yield Odometry(stamp_ns, pose @ self._T_base_lidar.inverse())
             try:
-                scan = self._load(self._files[index], stamp_ns, losses)
+                scan = self._load_scan(self._files[index], stamp_ns, losses)
             except (ScanFileError, OSError):
                 count_loss(losses, "scan files that cannot be read")
                 continue
@@ -125,7 +156,7 @@ class ScanFolder(FileSource):
         reason = ""
         for file in self._files[:_TRIES]:
             try:
-                scan = self._load(file, 0, {})
+                scan = self._load_scan(file, 0, {})
             except (ScanFileError, OSError) as error:
                 reason = reason or f"{file.name} cannot be read: {error}"
                 continue
@@ -183,6 +214,82 @@ class ScanFolder(FileSource):
                 return found
         return None
 
+    def _read_views(self) -> list[Pose3 | None] | None:
+        """Return the pose of the sensor in the header of each PCD file; None if most files have none."""
+        if self._suffix != ".pcd" or len(self._files) < 2:
+            return None
+        views = [_view_of(file) for file in self._files]
+        if 2 * sum(view is not None for view in views) < len(views):
+            return None
+        self._warnings.append("the motion is that of the sensor in the headers of the files (VIEWPOINT)")
+        # The first sensor is often the origin, which the header cannot tell from no pose.
+        return [view or (Pose3.identity() if k == 0 else None) for k, view in enumerate(views)]
+
+    def _find_frame(self, poses: list[Pose3 | None]) -> None:
+        """Find out by the scans whether their points are in the frame of the sensor or already in that of the
+        poses, from which they are then moved back.
+
+        Points are dense near the sensor that measured them: their mean logarithmic range counts from there.
+
+        Args:
+            poses: Pose of each scan.
+        """
+        moved = [k for k, pose in enumerate(poses) if pose is not None and np.hypot(*pose.t[:2]) > _DECISIVE]
+        gains = []
+        for k in moved[:: max(1, len(moved) // _TRIES)][:_TRIES]:
+            pose = poses[k]
+            try:
+                columns = self._columns(self._files[k], {})
+            except (ScanFileError, OSError):
+                continue
+            points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+            points = points[np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)]
+            if pose is not None and len(points):
+                gains.append(_mean_log(points) - _mean_log(points - pose.t))
+        if gains and float(np.median(gains)) > 0.0:
+            self._T_file_lidar = {
+                file: pose for file, pose in zip(self._files, poses, strict=True) if pose is not None
+            }
+            self._warnings.append(
+                "the points of the scans are in the frame of their poses: each was moved back by its pose"
+            )
+
+    def _decide_times(self) -> PointTimes | None:
+        """Return how the times of points are read, by the first _TRIES files; None without times. Times that
+        cannot be used, and those by the order of the points, become a warning."""
+        scans = []
+        for file, stamp_ns in zip(self._files[:_TRIES], self._stamp.tolist(), strict=False):
+            try:
+                timed = timed_scan(stamp_ns, self._columns(file, {}))
+            except (ScanFileError, OSError):
+                continue
+            # The order of points that were moved to another frame tells no direction of the sensor.
+            scans.append(replace(timed, points=None) if file in self._T_file_lidar else timed)
+        times, why = decide_point_times(scans)
+        if why:
+            self._warnings.append(f"the times of points cannot be used, so scans are not de-skewed: {why}")
+        elif times is not None and times.field == FIRING_ORDER:
+            self._warnings.append(f"times of points: {times.words}")
+        return times
+
+    def _columns(self, file: Path, losses: dict[str, int]) -> Columns:
+        """Return the columns of a file of points, see `read_columns`."""
+        table = open_rows(file) if self._suffix == ".bin" else open_points(file)
+        return read_columns(table, losses)
+
+    def _load_scan(self, file: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
+        """Return the scan of a file in the frame of the sensor; errors as those of a `Loader`."""
+        pose = self._T_file_lidar.get(file)
+        if pose is None:
+            return self._load(file, stamp_ns, self._times, losses)
+        columns = self._columns(file, losses)
+        points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        nothing = ~(points != 0.0).any(axis=1)
+        with np.errstate(invalid="ignore", over="ignore"):
+            points = (points - pose.t) @ pose.R
+        points[nothing] = np.nan  # a beam without a return
+        return scan_of(stamp_ns, {**columns, **dict(zip("xyz", points.T, strict=True))}, self._times)
+
     def _fitting(
         self, name: str, times: Int | None, poses: list[Pose3], numbers: Int
     ) -> list[Pose3 | None] | None:
@@ -206,7 +313,7 @@ class ScanFolder(FileSource):
         if rows is None:
             return None
         if times is not None:
-            self._stamp = times[rows]
+            self._stamp, self._timed = times[rows], True
         return [poses[row] for row in rows.tolist()]
 
     def _rows(self, name: str, count: int, numbers: Int) -> Int | None:
@@ -228,13 +335,35 @@ class ScanFolder(FileSource):
         return None
 
 
+def _form_words(file: Path) -> list[str]:
+    """Return why one file is taken as one scan, if its contents tell that; else []."""
+    try:
+        table = open_points(file)
+        return [form_of(table, sample_of(table)).words] if table.kind.startswith("PCD") else []
+    except (ScanFileError, OSError):
+        return []
+
+
+def _view_of(file: Path) -> Pose3 | None:
+    """Return the pose of the sensor in the header of a PCD file; None without one."""
+    try:
+        return open_table(file).view
+    except (ScanFileError, OSError):
+        return None
+
+
+def _mean_log(points: Float) -> float:
+    """Return the mean logarithm of the distances of points, shape (N, 3), from the origin."""
+    return float(np.log(np.maximum(np.linalg.norm(points, axis=1), 0.1)).mean())
+
+
 def _scan_files(path: Path) -> tuple[str, list[Path]]:
     """Return the suffix of the scans in a folder, or in its folder `velodyne` if it has no .bin file itself,
-    and the files with this suffix by number or time; if `path` is a file, only this one, with the suffix .bin
-    or else .pcd. Without .bin files it is .pcd, or else the most frequent suffix of a scan; there may be no
-    files. OSError if it cannot be read."""
+    and the files with this suffix by number or time; if `path` is a file, only this one, with the suffix .pcd
+    if its own is not one of a scan. Without .bin files it is .pcd, or else the most frequent
+    suffix of a scan; there may be no files. OSError if it cannot be read."""
     if path.is_file():
-        return path.suffix.lower() if path.suffix.lower() == ".bin" else ".pcd", [path]
+        return path.suffix.lower() if path.suffix.lower() in FORMATS else ".pcd", [path]
     inside = path / "velodyne"
     for folder in (path, inside) if inside.is_dir() else (path,):
         if bins := [file for file in folder.iterdir() if file.suffix.lower() == ".bin" and file.is_file()]:
@@ -283,13 +412,14 @@ _KITTI_ROW = 16  # bytes: four little-endian float32, x, y, z [m] and reflectanc
 HDL_64 = Sensor("HDL-64", 64, float(np.radians(0.4)), float(np.radians(0.17)), 0.03, 120.0)
 
 
-def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
+def load_bin(path: Path, stamp_ns: int, times: PointTimes | None, losses: dict[str, int]) -> Scan:
     """Read a KITTI .bin file as a scan, which may have no points. Invalid returns are left out
     (`clean_scan`); an incomplete last row is left out and counted in `losses`.
 
     Args:
         path: The file.
         stamp_ns: Time of the scan [ns].
+        times: How the times of points are read; None for scans without times.
         losses: Dict from reasons to numbers of what is left out; increased in place.
 
     Raises:
@@ -304,22 +434,22 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
         sound = (np.abs(rows[:, :3]) < RANGE_LIMIT).all(axis=1)
     if 2 * int(np.count_nonzero(sound)) < len(rows):
         raise ScanFileError("most of its rows are no positions")
-    scan = clean_scan(stamp_ns, rows[:, :3], reflectance=rows[:, 3])
+    scan = scan_of(stamp_ns, dict(zip(("x", "y", "z", "intensity"), rows.T, strict=True)), times)
     if size % _KITTI_ROW:
         count_loss(losses, "scan files that end within a point")
     return scan
 
 
-def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a PCD, PLY, NumPy, LAS or LAZ file as a scan at a time [ns], which may have no points; of LAS and
-    LAZ, the positions only. Invalid returns are left out (`clean_scan`); points of the header that the file
-    does not have are counted in `losses`, in place.
+def load_table(path: Path, stamp_ns: int, times: PointTimes | None, losses: dict[str, int]) -> Scan:
+    """Read a PCD, PLY, NumPy, LAS or LAZ file as a scan at a time [ns], which may have no points. Invalid
+    returns are left out (`clean_scan`); points of the header that the file does not have are counted in
+    `losses`, in place.
 
     Raises:
         ScanFileError: The file is damaged, has no x, y and z, or its header has more than POINT_LIMIT points.
         OSError: The file cannot be read.
     """
-    return scan_of(stamp_ns, read_columns(open_points(path), losses))
+    return scan_of(stamp_ns, read_columns(open_points(path), losses), times)
 
 
 def _kitti_sensor(scan: Scan) -> Sensor:

@@ -129,7 +129,7 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
     from pipeline.simulation.cloud_run import open_cloud_run
 
     trees = read_truth_trees(Path(request.truth).expanduser()) if request.truth else None
-    cloud = open_cloud(request.file)
+    cloud = open_cloud(request.file, options)
     try:
         run = open_cloud_run(request, cloud, trees, options.T_base_lidar)
     except SourceError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import islice
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -38,20 +38,37 @@ class TransformTree:
         """Return whether any transform names a frame."""
         return frame in self._links
 
+    def links(self) -> list[tuple[str, str]]:
+        """Return the pairs of frames with a transform, in both orders."""
+        return [(a, b) for a, others in self._links.items() for b in others]
+
+    def frames(self) -> list[str]:
+        """Return the names of all frames."""
+        return list(self._links)
+
     def find(self, target: str, source: str) -> Pose3 | None:
         """Return `T_target_source` along the fewest links; None if the frames are not linked. For equal names
         it is the identity, also if they are unknown."""
-        reached = {target: Pose3.identity()}
+        T = Pose3.identity()
+        frames = self.chain(target, source)
+        for frame, other in pairwise(frames):
+            T = T @ self._links[frame][other]
+        return T if frames else None
+
+    def chain(self, target: str, source: str) -> tuple[str, ...]:
+        """Return the frames from one to another along the fewest links, both included; () if they are not
+        linked. For equal names it is this one name."""
+        reached: dict[str, tuple[str, ...]] = {target: (target,)}
         border = [target]
         while border and source not in reached:
             ahead = []
             for frame in border:
-                for other, T_frame_other in self._links.get(frame, {}).items():
+                for other in self._links.get(frame, {}):
                     if other not in reached:
-                        reached[other] = reached[frame] @ T_frame_other
+                        reached[other] = (*reached[frame], other)
                         ahead.append(other)
             border = ahead
-        return reached.get(source)
+        return reached.get(source, ())
 
 
 def frame_name(name: object) -> str:
@@ -83,6 +100,7 @@ def is_odometry_link(parent: str, child: str) -> bool:
 #: Messages of fixed and of moving transforms that are read when a recording is opened.
 FIXED_MESSAGES = 1000
 MOVING_MESSAGES = 300
+_LAST_MESSAGES = 100
 _WORLD = ("map", "world", "earth", "odom", "utm")
 
 _UNREADABLE = "transforms that cannot be read"
@@ -105,20 +123,64 @@ class Extrinsics:
         self._channels: dict[int, Channel] = {c.number: c for c in container.channels}
         self.tree = TransformTree()
         self.odometry_link: tuple[str, str] | None = None
+        self._moving: dict[tuple[str, str], None] = {}  # links of moving channels
+        self._moved: list[tuple[str, str]] = []  # those that change
 
     def read(self, fixed: frozenset[int], moving: frozenset[int]) -> None:
-        """Add the transforms of the first messages of some channels to `tree`, and set `odometry_link`. Of
-        moving channels, only transforms that do not change and whose parent is not a world frame (_WORLD) are
-        added; fixed transforms replace them. Damaged messages are ignored. `odometry_link` stays None if the
-        first MOVING_MESSAGES moving messages have no transform of an odometry (`is_odometry_link`).
+        """Add the transforms of the first messages of some channels to `tree`. Of moving channels, only
+        transforms that do not change and whose parent is not a world frame (_WORLD) are added, and the last
+        messages are read too; fixed transforms replace them. Damaged messages are ignored.
 
         Args:
             fixed, moving: Numbers of the channels of fixed and of moving transforms.
         """
-        for (parent, child), pose in self._links(moving, MOVING_MESSAGES, steady=True).items():
+        seen, self._moved = self._links(moving, MOVING_MESSAGES)
+        self._moving = dict.fromkeys(seen)
+        for (parent, child), pose in seen.items():
+            if (parent, child) not in self._moved and parent.split("/")[-1] not in _WORLD:
+                self.tree.add(parent, child, pose)
+        for (parent, child), pose in self._links(fixed, FIXED_MESSAGES)[0].items():
             self.tree.add(parent, child, pose)
-        for (parent, child), pose in self._links(fixed, FIXED_MESSAGES, steady=False).items():
-            self.tree.add(parent, child, pose)
+
+    def choose_odometry(self, lidar: str, *, live: bool) -> str:
+        """Set `odometry_link` to the transform that carries the robot; it stays None if there is none. Its
+        child is linked to the LiDAR by fixed transforms, or its frames are named as usual. In a recording it
+        changes. Return a message for the user if the only one does not, else "".
+
+        Args:
+            lidar: Frame of the LiDAR.
+            live: Whether the run is live, so that the robot may stand still yet.
+        """
+        named = [link for link in self._moving if is_odometry_link(*link)]
+        linked = [
+            link
+            for link in self._moved
+            if lidar and self.tree.find(link[1], lidar) is not None and self.tree.find(link[0], lidar) is None
+        ]
+        found = [link for link in named if link in linked] + [link for link in named if link in self._moved]
+        found += linked + (named if live else [])
+        self.odometry_link = next(iter(found), None)
+        if self.odometry_link is None and named:
+            return (
+                f"the transform from {named[0][0]} to {named[0][1]} never changes: it is not used as odometry"
+            )
+        return ""
+
+    def world_chain(self, frame: str, odometry: str) -> tuple[str, ...]:
+        """Return the frames from that of a map to that of the odometry along fixed and moving transforms,
+        both included; () if they are not linked. For equal names it is this one name."""
+        links = [*self._moving, *self.tree.links()]
+        chains: dict[str, tuple[str, ...]] = {frame: (frame,)}
+        border = [frame]
+        while border and odometry not in chains:
+            ahead = [
+                (child, (*chains[parent], child))
+                for parent, child in links
+                if parent in border and child not in chains and (parent, child) != self.odometry_link
+            ]
+            chains.update(ahead)
+            border = [child for child, _ in ahead]
+        return chains.get(odometry, ())
 
     def base_frame(self, by_odometry: str, lidar: str) -> str:
         """Return the base frame: the first one with a fixed transform to the LiDAR, or else the first one, of
@@ -135,32 +197,24 @@ class Extrinsics:
         linked = (name for name in names if lidar and self.tree.find(name, lidar) is not None)
         return next(linked, next(iter(names), ""))
 
-    def _links(self, numbers: frozenset[int], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
-        """Return a dict from (parent, child) to the first pose T_parent_child in the first messages of some
-        channels. With `steady`, set `odometry_link` to the first transform that is odometry, and leave out
-        transforms that change or begin at a world frame (_WORLD).
-
-        Args:
-            numbers: Numbers of channels with transforms.
-            limit: Number of messages that are read.
-            steady: Whether the channels have moving transforms.
-        """
+    def _links(
+        self, numbers: frozenset[int], limit: int
+    ) -> tuple[dict[tuple[str, str], Pose3], list[tuple[str, str]]]:
+        """Return a dict from (parent, child) to the first pose T_parent_child in the first `limit` messages
+        of some channels and the last ones, and the list of those that change."""
         seen: dict[tuple[str, str], Pose3] = {}
-        moved: set[tuple[str, str]] = set()
-        for message in islice(self._container.messages(numbers, None, {}), limit if numbers else 0):
+        moved: dict[tuple[str, str], None] = {}
+        if not numbers:
+            return seen, []
+        tail_ns = self._container.tail_ns(numbers, _LAST_MESSAGES)
+        first = islice(self._container.messages(numbers, None, {}), limit)
+        for message in chain(first, self._container.messages(numbers, tail_ns, {})):
             for _stamp, parent, child, pose in self.decode(message, {}):
                 before = seen.setdefault((parent, child), pose)
-                if not (
-                    np.allclose(before.R, pose.R, atol=1e-9) and np.allclose(before.t, pose.t, atol=1e-9)
-                ):
-                    moved.add((parent, child))
-                if steady and is_odometry_link(parent, child) and self.odometry_link is None:
-                    self.odometry_link = (parent, child)
-        return {
-            link: pose
-            for link, pose in seen.items()
-            if not steady or (link not in moved and link[0].split("/")[-1] not in _WORLD)
-        }
+                same = np.allclose(before.R, pose.R, atol=1e-9) and np.allclose(before.t, pose.t, atol=1e-9)
+                if not same:
+                    moved[parent, child] = None
+        return seen, list(moved)
 
     def decode(self, message: Message, losses: dict[str, int]) -> list[Link]:
         """Return the finite transforms of a message, in its order; [] if it is damaged.

@@ -25,6 +25,8 @@ export const draft = {
   place: null, // {x, y, on} where it would be placed
   moved: null, // {id, row, x, y} while an annotation is dragged or nudged
   kind: "other", // class of a rejected tree
+  shown: null, // number of the tree whose evidence is on the card; the review answers for it
+  answer: null, // {number, kind} of the last answer of the review
   error: "",
   undo: 0,
   redo: 0,
@@ -32,6 +34,7 @@ export const draft = {
 const NO_VOTES = { needed: 0, of: new Map(), known: false };
 let votes = NO_VOTES; // of the decision trees for each found tree, by its number
 const versions = new Map(); // "id:version" of a row as it was shown, to the version that an own edit made of it
+const answering = new Set(); // numbers of the trees whose answers are on their way
 let last = Promise.resolve(), nudging = 0;
 
 export const annotating = () => visible("annotate");
@@ -66,12 +69,14 @@ export const send = (method, path, fields = {}) => request(path, { method, heade
   body: JSON.stringify({ run: state.annotations?.run, browser: me, who: myName(), ...fields }) });
 const call = (method, where, fields) => send(method, `/api/annotations${where}`, fields);
 
-// Edits are sent one at a time; each has come back before the next one is sent.
+// Edits are sent one at a time; each has come back before the next one is sent. An error stays until the person makes another
+// edit, and not only until the next one in the queue is stored.
 export function edit(work) {
+  draft.error = "";
   last = last.then(async () => {
     try {
       const done = await work();
-      Object.assign(draft, { undo: done.undo, redo: done.redo, error: "" });
+      Object.assign(draft, { undo: done.undo, redo: done.redo });
       await arrived(done.serial);
       return done;
     } catch (error) {
@@ -110,16 +115,16 @@ function latest({ id, version }) {
   return now;
 }
 
-export function change(row, fields) {
-  return edit(async () => {
-    const version = latest(row);
-    const { x, y, kind, dbh_cm } = { ...row, ...(version === row.version ? {} : storedRow(row.id)), ...fields };
-    const done = await call("PATCH", `/${row.id}`, { version, x, y, kind, dbh_cm });
-    await arrived(done.serial);
-    const now = storedRow(row.id)?.version ?? version;
-    if (now !== version) versions.set(`${row.id}:${version}`, now);
-    return done;
-  });
+export const change = (row, fields) => edit(() => patched(row, fields));
+
+async function patched(row, fields) {
+  const version = latest(row);
+  const { x, y, kind, dbh_cm } = { ...row, ...(version === row.version ? {} : storedRow(row.id)), ...fields };
+  const done = await call("PATCH", `/${row.id}`, { version, x, y, kind, dbh_cm });
+  await arrived(done.serial);
+  const now = storedRow(row.id)?.version ?? version;
+  if (now !== version) versions.set(`${row.id}:${version}`, now);
+  return done;
 }
 
 export function remove(row) {
@@ -139,6 +144,7 @@ const edited = () => ({
 // Annotations and plots have one history: tells what the step changed, and selects the tree of a single annotation.
 async function turn(where, word) {
   await settle();
+  draft.answer = null;
   let before = null, run = null;
   const done = await edit(() => {
     [before, run] = [edited(), state.annotations?.run];
@@ -203,7 +209,7 @@ const skippedAt = (tree) => annotationOf(tree)?.at_s ?? 0; // 0: open
 
 // Found trees that are open or skipped. Open trees come first, sorted by doubt and then by the number of observations; skipped
 // trees follow in the order in which they were skipped.
-export const unreviewed = () => trees().filter((tree) => !isReviewed(tree)).sort((a, b) =>
+export const unreviewed = () => trees().filter((tree) => !isReviewed(tree) && !answering.has(tree.number)).sort((a, b) =>
   skippedAt(a) - skippedAt(b) || compared(margin(a), margin(b)) || a.observations - b.observations || a.number - b.number);
 
 export const isReviewed = (tree) => (annotationOf(tree)?.kind ?? SKIPPED) !== SKIPPED;
@@ -227,17 +233,36 @@ const updateVotes = throttled(async () => {
   news();
 }, VOTES_EVERY);
 
-// Annotates the selected tree, then goes to the next one unless another tree was selected meanwhile.
+// Answers whether the tree on the card is a tree, and goes on to the next one at once. While the card loads, nothing is
+// answered: the person has not seen that tree yet.
 export async function review(kind) {
   const tree = selectedTree();
   if (!tree) {
     draft.error = "Select a found tree first: click it on the map, or press S for the next one.";
     return news();
   }
-  const row = annotationOf(tree);
-  if (row) await change(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind } : { kind });
-  else await add({ x: tree.x, y: tree.y, kind });
-  if (!draft.error && state.selected === tree.number) await next();
+  if (draft.shown === tree.number) await answer(tree, kind);
+}
+
+async function answer(tree, kind) {
+  const { number } = tree, seen = annotationOf(tree);
+  answering.add(number);
+  draft.answer = { number, kind };
+  const stored = edit(async () => {
+    const row = annotationOf(tree); // after the edits before this one
+    const isSeen = row && row.id === seen?.id && row.version === seen.version;
+    if (row && !isSeen && row.who !== myName()) throw new Error(`Tree ${number} was annotated by ${row.who} meanwhile; your answer was not stored.`);
+    return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind } : { kind })
+      : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null });
+  });
+  const told = draft.answer;
+  try {
+    if (state.selected === number) await next();
+    if (!await stored && draft.answer === told) draft.answer = null; // not that of a later tree
+  } finally {
+    answering.delete(number);
+    news();
+  }
 }
 
 // Returns a typed DBH [cm], null for an empty text, or undefined and shows an error.
@@ -256,30 +281,35 @@ export function measureDbh(tree, dbh) {
   return dbh === null ? null : add({ x: tree.x, y: tree.y, dbh_cm: dbh });
 }
 
-// Marks the selected tree as skipped if it is open, then goes to the next one.
+// Marks the tree on the card as skipped if it is open, and goes on to the next one.
 export async function skip() {
   const tree = selectedTree();
   draft.error = "";
-  if (tree && reviewOf(tree) === "open") {
-    await edit(() => call("POST", "", { x: tree.x, y: tree.y, kind: SKIPPED, dbh_cm: null }));
-    if (draft.error || state.selected !== tree.number) return;
-  }
-  await next();
+  if (!tree || reviewOf(tree) !== "open" || answering.has(tree.number)) await next();
+  else if (draft.shown === tree.number) await answer(tree, SKIPPED);
 }
 
 // Selects the most doubtful open tree other than the selected one; without one, the skipped tree that follows the selected one.
 // The order needs the votes: a key pressed before they have arrived waits for them.
 async function next() {
   if (!votes.known) await updateVotes.now();
-  const left = unreviewed();
-  const open = left.find((each) => each.number !== state.selected && reviewOf(each) === "open");
-  const tree = open ?? left[(left.findIndex(({ number }) => number === state.selected) + 1) % left.length];
+  const tree = following();
   draft.chosen = null;
   if (tree) select(tree.number);
   byId("panel-annotate").scrollTop = 0;
   draft.look = tree;
   news();
 }
+
+// The tree that the review shows after the selected one.
+export function following() {
+  const left = unreviewed();
+  const open = left.find((each) => each.number !== state.selected && reviewOf(each) === "open");
+  return open ?? left[(left.findIndex(({ number }) => number === state.selected) + 1) % left.length];
+}
+
+// What the last answer of the review said ("Tree 40: pole"); "" before the first one.
+export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${draft.answer.kind}` : "");
 
 // --- the chosen annotation -------------------------------------------------------------------------------------
 

@@ -8,32 +8,46 @@ import { keepFresh, throttled } from "../core/timing.js";
 import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
 import { sectionsFigure } from "../explain/sections.js";
-import { annotating, annotationOf, measureDbh, reviewOf, typedDbh } from "./annotations.js";
+import { annotating, annotationOf, draft, following, measureDbh, reviewOf, typedDbh } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
+const KEPT = 4; // stories that are loaded ahead or shown
 let shown = "", pictured = null; // version of the shown evidence; number of the tree of the camera picture
+const stories = new Map(); // promise of each story by its version
 
 const evidence = () => byId("review-evidence");
 
 // The card around `hint`, which is visible without a selected tree, too.
 export const card = (hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
   el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" })),
-  el("label", { class: "review-dbh", title: "A reference for the scores and for learning, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
+  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
   el("div", { id: "review-evidence" }), hint,
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
+const versionOf = (number) => `${state.annotations?.run} ${number} ${state.map.index} ${state.parameters?.revision}`;
+
+function story(number) {
+  const version = versionOf(number);
+  if (!stories.has(version)) {
+    stories.set(version, get(`/api/story/tree/${number}`));
+    stories.get(version).catch(() => stories.delete(version));
+    for (const old of [...stories.keys()].slice(0, -KEPT)) stories.delete(old);
+  }
+  return stories.get(version);
+}
+
 const refresh = keepFresh(async () => {
   const tree = annotating() ? selectedTree() : null;
   if (!tree) return;
-  const { number } = tree, version = `${number} ${state.map.index} ${state.parameters?.revision}`;
+  const { number } = tree, version = versionOf(number);
   if (version === shown) return;
   let points, votes = "", loaded = "";
   try {
-    const story = await get(`/api/story/tree/${number}`);
-    points = story.sections ? sectionsFigure(story.sections) : gatheredFigure(story);
-    if (!story.sections) votes = columnFigure(story.column, "Votes on the accumulated scans");
+    const told = await story(number);
+    points = told.sections ? sectionsFigure(told.sections) : gatheredFigure(told);
+    if (!told.sections) votes = columnFigure(told.column, "Votes on the accumulated scans");
     loaded = version;
   } catch (error) {
     points = el("p", { class: "empty", text: capital(error.message) });
@@ -44,6 +58,8 @@ const refresh = keepFresh(async () => {
   byId("review-votes").replaceChildren(votes);
   evidence().dataset.tree = String(number);
   fillCard();
+  const ahead = following();
+  if (ahead) story(ahead.number).catch(() => undefined); // the card shows its error when it comes to it
 }, PAUSE);
 
 // The selection may have changed when a person leaves the field: its DBH belongs to the tree that the field shows.
@@ -79,10 +95,12 @@ export function fillCard() {
   byId("review").classList.toggle("empty-card", !tree);
   if (!tree) {
     shown = "";
-    pictured = null;
+    pictured = draft.shown = null;
+    delete evidence().dataset.tree; // a tree of another run may have its number
     return;
   }
   const old = evidence().dataset.tree !== String(tree.number), review = reviewOf(tree);
+  draft.shown = old ? null : tree.number;
   setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
   setText(byId("review-state"), review);
   byId("review-state").dataset.state = review;

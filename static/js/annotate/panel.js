@@ -4,11 +4,11 @@ import { button, byId, el, setText } from "../core/dom.js";
 import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
+import { annotating, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, startCard } from "./card.js";
-import { learnSection, startLearning } from "./learning.js";
 import { startSection } from "./section.js";
 
 const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
@@ -44,6 +44,7 @@ function build() {
       button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree"), ""),
       button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class on the right (N)", () => review(draft.kind), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
       button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, "")),
+    el("p", { id: "review-last", class: "review-last", hidden: true, role: "status" }, el("span"), " ", button("review-back", "Undo", "Undo this answer (Ctrl+Z)", undo, "quiet small")),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     card(el("p", { id: "annotate-hint", class: "note dim", role: "status" })),
     el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
@@ -58,7 +59,7 @@ function build() {
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,
       el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "Save CSV", title: "Download the annotations as CSV" }),
       el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "Save GeoJSON", title: "Download the annotations as GeoJSON" })),
-    learnSection());
+    ...ofExtensions("annotateSections"));
 }
 
 async function take(file, unit) {
@@ -124,6 +125,8 @@ function fill() {
   setText(byId("annotate-error"), problem || draft.error);
   setText(byId("annotate-hint"), hint(selected && left.includes(selected) ? selected : null));
   fillCard();
+  byId("review-last").hidden = !answerText();
+  setText(byId("review-last").firstChild, answerText());
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), contradictionText());
@@ -155,7 +158,6 @@ function fillTable() {
 
 export function startAnnotatePanel() {
   build();
-  startLearning();
   startCard();
   startSection();
   on("map", throttled(fill, EVERY));

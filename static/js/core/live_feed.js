@@ -17,17 +17,17 @@ const receivers = {
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   annotations(message) { state.annotations = message; },
-  learning(message) { state.learning = message; },
   selection(message) { receiveSelection(message.tree ?? null, message.cluster ?? null, message.place ?? null); },
   events(message) { state.events = message.events; },
   view(message) { state.view = message; },
   remapped(message) { state.remapped = message.ghost ? message : null; },
   rough(message) { state.rough = message.places ? { ...message, ghost: message.places.map(([x, y]) => [x, y, null]), changes: [] } : null; },
-  search(message) { state.search = message; },
   loop(message) { state.loop = message.to_s === undefined ? null : message; },
-  sensitivity(message) { state.sensitivity = message.name ? message : null; },
   missing(message) { state.missing = message; },
 };
+
+// A further kind of message, as of an extension.
+export const receive = (type, receiver) => { receivers[type] = receiver; };
 
 function receiveMap({ path, ...map }) {
   state.path.length = Math.min(state.path.length, path.start);

@@ -8,7 +8,7 @@ import { showProblem } from "./problem.js";
 const CONTROLS = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open", "#plots-edit"];
 const PANELS = ["panel-annotate", "panel-tune"];
 
-export let access = { role: "owner", viewer_link: null, viewers: null, robots: null };
+export let access = { role: "owner", viewer_link: null, viewers: null };
 export const looksOnly = () => access.role === "viewer";
 // Marks an action that changes something: in a view-only page it is not listed and its key does nothing.
 export const edits = (run) => Object.assign((...args) => (looksOnly() ? undefined : run(...args)), { edits: true });
@@ -40,10 +40,6 @@ export async function startAccess() {
   } catch (error) {
     showProblem(`It is not known whether this page may change the run: ${error.message}`);
     return;
-  }
-  if (access.robots) {
-    const title = "All robots: one card each, and one common map";
-    document.querySelector(".strip-end").prepend(el("a", { id: "robots-link", class: "quiet small", href: access.robots, text: "All robots", title }));
   }
   if (!looksOnly()) return;
   document.body.classList.add("viewer");

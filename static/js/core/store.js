@@ -8,7 +8,6 @@ export const state = {
   truth: null,       // ground truth trees
   evaluation: null,  // the map scored against the ground truth
   annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}], skipped: likewise, plots, georeference}
-  learning: null,    // {state, words, learned}: decision trees being trained from annotations
   parameters: null,  // {preset, set, revision, undo, redo, values, changed}
   sets: null,        // {sets: [{name, who, at_s}]}: saved sets of parameters
   holds: null,       // test of a tree by the filter of the table; null without a filter
@@ -23,8 +22,6 @@ export const state = {
   events: [],        // [{t, kind, text}] in order of time
   remapped: null,    // {revision, scans, before, after, ghost: [[x, y, dbh]], changes: [{kind, number, x, y, why}]}
   rough: null,       // {revision, places: [[x, y]], ghost, changes}: preview of a re-mapping, not a score
-  sensitivity: null, // {name, of, points: [{value, f1, TA, TA_of, false, …} or {value, error}], asked_with, error}
-  search: null,      // {state, goal, made, wanted, go_on, start, best, points, held_out, scores, importance, better, changes}
   loop: null,        // {from_s, to_s}: the part that playback repeats
   connected: false,
   lostAt: 0,         // when the connection was lost [ms], 0 while it is open

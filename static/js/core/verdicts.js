@@ -12,16 +12,17 @@ const VERDICTS = {
   "too long": ["L", "other", "λ1/λ2 is above Maximum eccentricity."],
   "not round": ["S", "bush", "The radial deviation of its points is above Maximum radial deviation."],
   "too thin": ["N", "pole", "The radius of the fitted circle is below Minimum radius."],
-  "too thick": ["K", "other", "The radius of the fitted circle is above Maximum radius, or the cluster is wider than Maximum width."],
+  "too thick": ["K", "other", "The radius of the fitted circle is above Maximum radius (Maximum radius in a cloud), or the cluster is wider than Maximum width."],
   "too low": ["D", "other", "Its visible height is below Minimum visible height."],
   "no arc": ["A", "uncertain", "The visible arc of the circle is below Minimum visible arc."],
   "at border": ["E", "uncertain", "It is cut by the pass-through box or the field of view."],
   moving: ["M", "person", "It moves or has moved away."],
+  stump: ["U", "other", "Round as a stem, but it ends below breast height."],
   hidden: ["X", "uncertain", "Its edge is occluded by a nearer object."],
 };
 
 // Plurals; a label that is missing here is not a noun and stays as it is ("3 too few points").
-const MANY = { tree: "trees", pole: "poles", person: "persons", bush: "bushes", wall: "walls", "other object": "other objects" };
+const MANY = { tree: "trees", pole: "poles", person: "persons", bush: "bushes", wall: "walls", stump: "stumps", "other object": "other objects" };
 
 // "1 bush", "33 bushes".
 export const counted = (number, label) => `${number} ${number === 1 ? label : (MANY[label] ?? label)}`;

@@ -41,14 +41,18 @@ function why(story) {
   if (failed.verdict === "at border") return "It extends beyond the pass-through box, the range or the field of view, so a part of it is not visible.";
   if (!failed.relation) return "Its edge is occluded by a nearer object, so its centre is unknown.";
   const side = failed.relation === "at most" ? "above" : "below";
-  return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${failed.title}, ${plain(failed.limit, failed.unit)}.`;
+  return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${limitOf(failed)}.`;
 }
 
 function whyOfCloud(story, failed) {
   if (!failed && story.verdict === "tree") return `It passed all checks below. It is tree ${story.tree} of the map.`;
   if (!failed) return `It passed all checks below, but the decision trees classify its surroundings as ${story.verdict}.`;
   const side = failed.relation === "at most" ? "above" : "below";
-  return `Its ${named(failed)}, ${plain(failed.value, failed.unit)}, is ${side} the limit of ${plain(failed.limit, failed.unit)}.`;
+  return `Its ${named(failed)}, ${plain(failed.value, failed.unit)}, is ${side} ${limitOf(failed)}.`;
+}
+
+function limitOf({ limit, unit, title, parameter }) {
+  return parameter ? `${title}, ${plain(limit, unit)} (${parameter})` : `the limit of ${plain(limit, unit)}`;
 }
 
 function drawing(story) {

@@ -58,7 +58,7 @@ function featureTexts(name, value) {
 // Explanations of verdicts that a rule decided, not the votes.
 const RULES = {
   tree: (g) => `Accepted as tree: single scans fitted a round trunk on more than half of its circumference, so votes against a round stem count a tenth. A tree needs ${share(g.tree_share)} of the votes.`,
-  moving: (g) => `Rejected as moving: empty in ${g.absent} of ${count(g.absent + g.present, "scan")} with a clear view.`,
+  moving: (g) => `Rejected as moving: empty in ${g.absent} of ${count(g.absent + g.present, "scan")} with a clear view${g.absent_lately > 1 ? `, among them the last ${g.absent_lately}` : ""}.`,
   "too low": () => "Rejected as too low: less than 30 % of the rays at breast height (1.2 to 2.2 m above the ground), or above a person's height (2.2 to 3.2 m), ended at it.",
   "too few points": () => "Rejected as too few points: so few voxels can be occupied by chance.",
 };
@@ -83,8 +83,10 @@ function reason(story) {
   const rule = RULES[story.verdict];
   if (!story.by_votes && rule) return rule(story);
   const verdict = story.verdict === "tree" ? "A tree" : `Not a tree: ${story.verdict}`;
-  return `${verdict}, by the votes of the decision trees; a tree needs ${share(story.tree_share)} of them. ${freeEndText(story.tree_in_free_air)}In ${story.present} of ${count(story.present + story.absent, "scan")} with a clear view of this place, something stood here.`;
+  return `${verdict}, by the votes of the decision trees; a tree needs ${share(story.tree_share)} of them. ${freeEndText(story.tree_in_free_air)}${clearViewText(story.present, story.present + story.absent)}`;
 }
+
+export const clearViewText = (present, all) => (all ? `In ${present} of ${count(all, "scan")} with a clear view of this place, something stood here.` : "");
 
 // Objects with a free upper end get additional votes on tree or pole.
 function freeEndText(part) {

@@ -1,11 +1,12 @@
 // The tab Story: why a cluster or a tree has its verdict. The story of a cluster belongs to its scan; that of a tree is updated.
 
+import { annotationOf, reviewOf } from "../annotate/annotations.js";
 import { get } from "../core/api.js";
 import { byId, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { capital } from "../core/format.js";
 import { selectCluster } from "../core/live_feed.js";
-import { on, state } from "../core/store.js";
+import { on, selectedTree, state } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { onSceneLoad } from "../scene/scene.js";
 import { openTab, visible } from "../shell/tabs.js";
@@ -28,7 +29,18 @@ function wanted() {
     return { kind: "cluster", title: clusterTitle(state.selectedCluster), name: `cluster ${scan} ${cluster}`, version: "", path: `/api/story/cluster/${cluster}?scan=${scan}` };
   }
   if (state.selected === null) return null;
-  return { kind: "tree", title: `Tree ${state.selected}`, name: `tree ${state.selected}`, version: `${state.map?.index} ${state.parameters?.revision}`, path: `/api/story/tree/${state.selected}` };
+  return { kind: "tree", title: `Tree ${state.selected}`, name: `tree ${state.selected}`, version: `${state.map?.index} ${state.parameters?.revision} ${rejectedAs()}`, path: `/api/story/tree/${state.selected}` };
+}
+
+// Class that a person gave the selected tree, which is none by it; "" for other trees.
+function rejectedAs() {
+  const tree = selectedTree();
+  return tree && reviewOf(tree) === "rejected" ? annotationOf(tree).kind : "";
+}
+
+function rejection() {
+  const kind = rejectedAs();
+  return kind && el("p", { class: "note", "data-rejected": kind, text: `A person rejected this tree in the review (class: ${kind}), so it does not count as a tree. The verdict below is that of the mapping.` });
 }
 
 async function show() {
@@ -66,7 +78,7 @@ function fill(subject, story) {
   const sameSubject = panel().dataset.story === subject.name, top = panel().scrollTop;
   shown = `${subject.name} ${subject.version}`;
   Object.assign(panel().dataset, { story: subject.name, scan: story.scan });
-  body().replaceChildren(...(subject.kind === "cluster" ? clusterStory(story) : treeStory(story, chooseCluster)).filter(Boolean));
+  body().replaceChildren(...(subject.kind === "cluster" ? clusterStory(story) : [rejection(), ...treeStory(story, chooseCluster)]).filter(Boolean));
   markOld(subject);
   panel().scrollTop = sameSubject ? top : 0;
 }
@@ -141,6 +153,7 @@ export function startStory() {
   panel().append(el("div", { class: "story-head" }), el("p", { class: "story-wait note dim", role: "status", hidden: true }), el("div", { class: "story-body" }));
   on("selection", onSelection);
   on("map", update);
+  on("annotations", update);
   on("status", () => {
     if (state.status?.state === "playing") return;
     update();

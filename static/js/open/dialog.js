@@ -53,12 +53,22 @@ const entry = (uri, title, doc, address = () => uri) =>
 
 // --- whole clouds: mapped as a whole, or driven through by a simulated robot ---------------------------
 
-const isWholeCloud = (uri) => /\.(laz|las|e57|ply|npy|npz)$/i.test(uri);
+const isWholeCloud = (uri) => /\.(laz|las|e57|ply|npy|npz|pcd|xyz|asc|pts|txt|csv)$/i.test(uri);
 const choice = () => byId("source-form").elements.namedItem("cloud-choice").value;
+const path = () => byId("source-uri").value.trim();
+const CHOICES = ["source-as", "source-unit", "source-up", "source-odometry"]; // of one source; topics and mounting are kept by address
+let chosenAt = ""; // path for which they were chosen; "" if before a path was entered
 
-// A whole cloud that is mapped as it is has no odometry; a robot that drives through it has.
+function forget() {
+  for (const id of CHOICES) byId(id).value = "auto";
+  byId("source-form").elements.namedItem("cloud-choice").value = "map";
+  chosenAt = "";
+}
+
+// A whole cloud that is mapped as it is has no odometry; a robot that drives through it has. Choices for another path do not count.
 function showChoice() {
-  const cloud = isWholeCloud(byId("source-uri").value.trim());
+  if (chosenAt && chosenAt !== path()) forget();
+  const cloud = isWholeCloud(path());
   byId("source-cloud").hidden = !cloud;
   byId("source-motion").hidden = cloud && choice() === "map";
 }
@@ -68,6 +78,14 @@ function offerChoice(uri) {
   byId("source-uri").value = uri;
   showChoice();
   byId("source-open").focus();
+}
+
+// Form, unit and axis that were chosen for the file of points in the field; {} for other sources.
+function chosenPoints(uri) {
+  const typed = path();
+  if (!isWholeCloud(typed) || uri !== chosenUri(typed)) return {};
+  const chosen = { form: byId("source-as").value, unit: byId("source-unit").value, up: byId("source-up").value };
+  return Object.fromEntries(Object.entries(chosen).filter(([, value]) => value !== "auto"));
 }
 
 const chosenUri = (uri) => (isWholeCloud(uri) && choice() === "drive" ? `sim:cloud?${new URLSearchParams({ file: uri })}` : uri);
@@ -82,7 +100,7 @@ export async function ask(uri) {
   say("");
   setText(byId("source-open"), "Opening…");
   try {
-    await open({ uri, odometry: byId("source-odometry").value, ...chosenFor(uri) });
+    await open({ uri, odometry: byId("source-odometry").value, ...chosenPoints(uri), ...chosenFor(uri) });
     if (requested !== uri) return;
     asked = uri;
     follow(state);
@@ -115,10 +133,14 @@ export function startSources() {
   byId("source-close").addEventListener("click", () => finish(""));
   byId("source-form").addEventListener("submit", (event) => {
     event.preventDefault();
-    ask(chosenUri(byId("source-uri").value.trim()));
+    ask(chosenUri(path()));
   });
   byId("source-uri").addEventListener("input", showChoice);
-  byId("source-cloud").addEventListener("change", showChoice);
+  for (const id of ["source-cloud", "source-motion"]) byId(id).addEventListener("change", () => {
+    chosenAt = path();
+    showChoice();
+  });
+  dialog.addEventListener("close", forget);
   startInside();
   on("status", follow);
   startUpload(async ({ uri }) => { if (!dialog.open) await openSources(); ask(uri); });

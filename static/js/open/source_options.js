@@ -61,7 +61,7 @@ function roles(topics) {
     if (!fitting.length) return [];
     const read = fitting.find(({ read_as: as }) => as === role);
     const list = el("select", { name: role, id: `inside-${role}` },
-      el("option", { value: "", text: read ? `${read.name} (found by type)` : "found by type" }),
+      el("option", { value: "", text: read ? `${read.name} (found)` : "none found" }),
       ...fitting.filter((topic) => topic !== read).map((topic) => el("option", { value: topic.name, text: [topic.name, figures(topic)].filter(Boolean).join(", ") })));
     return [el("label", { for: `inside-${role}`, text: title }), list];
   });
@@ -78,10 +78,14 @@ function mounting(mount) {
 }
 
 function table(topics) {
-  const rows = topics.map((topic) => el("tr", {}, el("th", { scope: "row", text: topic.name }), el("td", { text: topic.type.split("/").pop() }),
-    el("td", { text: figures(topic) }), el("td", { text: topic.read_as ? `used as ${topic.read_as}` : topic.why_not })));
+  const rows = topics.flatMap((topic) => [
+    el("tr", {}, el("th", { scope: "rowgroup", colspan: "2" }, topic.name, el("span", { text: [topic.type.split("/").pop(), figures(topic)].filter(Boolean).join(", ") }))),
+    ...[["use", use(topic)], ...(topic.details ?? [])].filter(([, text]) => text).map(([word, text]) => el("tr", { class: "inside-detail" }, el("td", { text: word }), el("td", { text }))),
+  ]);
   return el("div", { class: "inside-topics" }, el("table", {}, el("tbody", {}, ...rows)));
 }
+
+const use = ({ read_as: as, why, why_not: whyNot }) => (as ? `used as ${as}${why ? ` (${why})` : ""}` : whyNot && `not used: ${whyNot}`);
 
 export function startInside() {
   byId("source-inside").addEventListener("toggle", look);

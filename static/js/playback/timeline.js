@@ -1,6 +1,6 @@
 // Play, step, seek and speed.
 
-import { command } from "../core/api.js";
+import { command, post } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { clock, count } from "../core/format.js";
 import { startPopover } from "../core/popover.js";
@@ -107,9 +107,13 @@ export function parametersText() {
 
 function showPreset() {
   setText(byId("preset"), parametersText());
+  const { unsuited } = state.parameters, fit = byId("preset-fit");
+  fit.hidden = !unsuited;
+  setText(fit, unsuited && `Use ${unsuited}`);
 }
 
 export function startTimeline() {
+  byId("preset-fit").addEventListener("click", () => attempted(() => post("/api/parameters/preset", { name: state.parameters.unsuited })));
   byId("play").addEventListener("click", togglePlay);
   for (const [id, scans] of [["back10", -10], ["back1", -1], ["on1", 1], ["on10", 10]]) {
     byId(id).addEventListener("click", () => advance(scans));

@@ -181,9 +181,8 @@ function load() {
   fill();
 }
 
-// How a reference system was found; a frame of an earlier version has it as text.
-function methodText({ method, numbers, how: text }) {
-  if (text) return text.replace(/^by /, "");
+// How a reference system was found.
+function methodText({ method, numbers }) {
   const { points: used, fixes, rms_m: rms, sigma_point_m: sigma, sigma_turn_deg: turn } = numbers;
   if (method === "control") return `${count(used, "control point")}, ${fixed(rms, 3)} m (RMS), a coordinate of a point ± ${fixed(sigma, 3)} m, turn ± ${fixed(turn, 3)}°`;
   if (method === "gnss") return `${used} of ${fixes} GNSS fixes, ${fixed(rms, 2)} m (RMS) from the path, turn ± ${fixed(turn, 2)}°`;

@@ -23,6 +23,7 @@ const VOLUME = ["volume m³/ha", "Stem volume per hectare"];
 let figures = { all: null, plots: null, problem: "" };
 let shown = []; // edition and scan of the figures
 let run = null; // run of the fields and the table
+const lines = new Map(); // the row of each plot
 
 // --- the settings of the figures, which this browser remembers ------------------------------------------------------
 
@@ -125,33 +126,58 @@ function cells(of, withVolume) {
   return [...about.map((text) => el("td", { text })), ...names.map((name) => estimate(of[name]))];
 }
 
-function radiusOf(plot) {
-  const { kind, radius } = plot.shape;
-  if (kind !== "circle") return "";
-  if (looksOnly()) return ` radius ${radius} m`;
-  return el("label", { class: "plot-radius" }, " radius ", el("input", { type: "number", value: radius, min: "0.01", max: "600", step: "any", required: true, "aria-label": `Radius of plot ${plot.name}, m`, onchange: ({ target }) => target.reportValidity() && changePlot(plot, { radius: target.valueAsNumber }) }), " m");
+// The row of a plot stays while its figures change, so that what a person types and selects in it stays too.
+function lineOf(plot) {
+  const line = { plot, inputs: {} };
+  const heading = el("th", { scope: "row" });
+  if (looksOnly()) heading.append(line.text = el("span"));
+  else {
+    line.inputs.name = el("input", { type: "text", maxlength: "60", "aria-label": `Name of plot ${plot.name}`, onchange: ({ target }) => changePlot(line.plot, { name: target.value }) });
+    heading.append(line.inputs.name);
+    if (plot.shape.kind === "circle") {
+      line.inputs.radius = el("input", { type: "number", min: "0.01", max: "600", step: "any", required: true, onchange: ({ target }) => target.reportValidity() && changePlot(line.plot, { radius: target.valueAsNumber }) });
+      heading.append(el("label", { class: "plot-radius" }, " radius ", line.inputs.radius, " m"));
+    }
+  }
+  line.gone = el("button", { class: "quiet small", "data-edit": true, text: "✕", title: "Delete", onclick: () => remove(line.plot) });
+  line.node = el("tr", { "data-plot": plot.id }, heading, el("td", {}, line.gone));
+  return line;
 }
 
-function line(plot, of, withVolume) {
-  const name = looksOnly() ? plot.name : el("input", { type: "text", value: plot.name, maxlength: "60", "aria-label": `Name of plot ${plot.name}`, onchange: (event) => changePlot(plot, { name: event.target.value }) });
-  const gone = el("button", { class: "quiet small", "data-edit": true, text: "✕", title: "Delete", "aria-label": `Delete plot ${plot.name}`, onclick: () => remove(plot) });
-  return el("tr", { "data-plot": plot.id }, el("th", { scope: "row" }, name, radiusOf(plot)), ...cells(of ?? {}, withVolume), el("td", {}, gone));
+function showLine(line, plot, of, withVolume) {
+  const { name, shape } = plot;
+  line.plot = plot;
+  if (line.text) setText(line.text, shape.kind === "circle" ? `${name} radius ${shape.radius} m` : name);
+  for (const [which, input] of Object.entries(line.inputs)) {
+    const value = String(which === "name" ? name : shape.radius), shownBefore = input.defaultValue;
+    input.setAttribute("aria-label", which === "name" ? `Name of plot ${name}` : `Radius of plot ${name}, m`);
+    if (shownBefore !== value) input.defaultValue = value;
+    const typing = input === document.activeElement && input.value !== shownBefore;
+    if (!typing && input.value !== value) input.value = value;
+  }
+  line.gone.setAttribute("aria-label", `Delete plot ${name}`);
+  for (const cell of [...line.node.cells].slice(1, -1)) cell.remove();
+  line.node.lastChild.before(...cells(of ?? {}, withVolume));
 }
 
-function fillTable(another) {
-  const table = byId("plots-table");
-  const typing = table.contains(document.activeElement) && document.activeElement.matches("input") ? document.activeElement : null;
-  if (typing && !another && ![...plots().map(({ name }) => name), ...plots().map(({ shape }) => String(shape.radius))].includes(typing.value)) return; // a person types
-  const edited = typing?.closest("tr").dataset.plot;
+function fillTable() {
+  const table = byId("plots-table"), body = table.tBodies[0];
   const found = figures.plots, withVolume = Boolean(formula());
   const heads = [...HEADS, ...(withVolume ? [VOLUME] : [])];
   table.tHead.replaceChildren(el("tr", {}, ...heads.map(([text, title]) => el("th", { scope: "col", text, title })), el("td")));
   const sum = (text, of) => el("tr", { class: "sum" }, el("th", { scope: "row", text }), ...cells(of, withVolume), el("td"));
-  table.tBodies[0].replaceChildren(...plots().map((plot) => line(plot, found?.plots[plot.name], withVolume)),
-    ...(found && plots().length > 1 ? [sum("mean", found.mean)] : []),
+  for (const row of body.querySelectorAll(".sum")) row.remove();
+  const known = new Set(plots().map(({ id }) => id));
+  for (const [id, { node }] of lines) if (!known.has(id)) { node.remove(); lines.delete(id); } // first: a row that moves loses the focus
+  plots().forEach((plot, place) => {
+    if (!lines.has(plot.id)) lines.set(plot.id, lineOf(plot));
+    const line = lines.get(plot.id);
+    showLine(line, plot, found?.plots[plot.name], withVolume);
+    if (body.rows[place] !== line.node) body.insertBefore(line.node, body.rows[place] ?? null);
+  });
+  body.append(...(found && plots().length > 1 ? [sum("mean", found.mean)] : []),
     ...(figures.all ? [sum("all observed", figures.all.plots.all)] : []));
-  table.hidden = !table.tBodies[0].rows.length;
-  if (typing) table.querySelector(`[data-plot="${edited}"] input[type=${typing.type}]`)?.focus();
+  table.hidden = !body.rows.length;
 }
 
 const LEFT_OUT = { outside_of_plots: "outside the plots", outside_of_observed_area: "outside the observed area", below_minimum_dbh: "below the minimum DBH" };
@@ -200,20 +226,21 @@ function reviewText() {
     references && "Diameters by tape and trees that the map lacks are references for the scores; they do not count here."].filter(Boolean).join(" ");
 }
 
-// Returns whether another run is open, which begins with empty fields.
+// Another run begins with empty fields.
 function resetFields() {
   const now = state.annotations?.run;
-  if (!now || now === run) return false;
+  if (!now || now === run) return;
   if (run) draft.error = "";
   run = now;
   for (const form of document.querySelectorAll("#plots-edit form")) form.reset();
   byId("plot-crs").value = "";
-  return true;
+  for (const { node } of lines.values()) node.remove();
+  lines.clear();
 }
 
 function fill() {
   if (!plotting()) return;
-  const another = resetFields();
+  resetFields();
   for (const kind of Object.keys(SHAPES)) byId(`plot-${kind}`).setAttribute("aria-pressed", String(sketch.kind === kind));
   byId("plot-undo").disabled = !draft.undo;
   byId("plot-redo").disabled = !draft.redo;
@@ -225,7 +252,7 @@ function fill() {
   byId("plots-warnings").replaceChildren(...warnings.map((text) => el("li", { text })));
   setText(byId("plots-detection"), detectionText());
   setText(byId("plots-review"), reviewText());
-  fillTable(another);
+  fillTable();
   byId("plots-table").classList.toggle("old", figures.all !== null && shown[0] !== edition());
 }
 

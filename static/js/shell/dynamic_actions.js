@@ -13,8 +13,8 @@ import { openSources } from "../open/dialog.js";
 import { chooseView, toggleLayer } from "../scene/layers.js";
 import { openParameter } from "../tune/panel.js";
 import { attempt, isChanged, savedSets, shown, specOf, tuning, use } from "../tune/parameters.js";
-import { requestSensitivity } from "../tune/sensitivity.js";
 import { openDrawer, toTab } from "./actions.js";
+import { ofExtensions } from "./extensions.js";
 import { NAMES as TABS } from "./tabs.js";
 
 const AGAINST = [["both", "ground truth and annotations"], ["own", "ground truth only"], ["annotations", "annotations only"]];
@@ -26,7 +26,7 @@ const ALSO = {
 const CHOICES = { colour_by: "Colour the scene by", label_by: "Label the scene with", accumulated: "Accumulated map of the" };
 
 // Whether a button exists and is not hidden, apart from its panel being closed.
-function exists(id) {
+export function exists(id) {
   for (let at = byId(id); at; at = at.parentElement) {
     if (at.matches("[role=tabpanel], dialog, body")) return true;
     if (at.hidden) return false;
@@ -35,7 +35,7 @@ function exists(id) {
 }
 
 // Opens the panel and presses its button; a disabled button is only shown.
-const pressIn = (tab, id) => () => {
+export const pressIn = (tab, id) => () => {
   toTab(tab)();
   requestAnimationFrame(() => {
     const node = byId(id);
@@ -46,23 +46,17 @@ const pressIn = (tab, id) => () => {
 
 // Buttons of the panels: title, tab, id. Those that do not exist now are left out.
 const BUTTONS = [
-  ["Tune for me: search for the parameters with the best score", "tune", "search-open"], ["Tune for me: search again", "tune", "search-again"],
-  ["Stop the search for parameters", "tune", "search-stop"], ["Use the parameters that were found", "tune", "search-use"], ["Save the parameters that were found as a set", "tune", "search-save"],
   ["Delete the saved set of parameters", "tune", "tune-delete"],
-  ["Learn: use the new decision trees", "annotate", "learn-use"], ["Learn: keep the old decision trees", "annotate", "learn-forget"],
-  ["Learn: stop the training", "annotate", "learn-stop"], ["Learn: use the built-in decision trees", "annotate", "learn-package"],
 ];
 
 const panels = () => [
   ...BUTTONS.filter(([, , id]) => exists(id)).map(([title, tab, id]) => [title, "", edits(pressIn(tab, id))]),
-  ["Learn: train decision trees from the annotations", "", edits(pressIn("annotate", "learn-grow"))],
   [`Re-map the whole run after a change: switch ${state.parameters?.whole ?? true ? "off" : "on"}`, "", edits(() => { toTab("tune")(); attempt(() => put("/api/parameters/reach", { whole: !(state.parameters?.whole ?? true) })); })],
   ["Download the annotations as CSV", "", () => location.assign("/api/annotations.csv")], ["Download the annotations as GeoJSON", "", () => location.assign("/api/annotations.geojson")],
   ["Annotate: your name", "", edits(() => { toTab("annotate")(); byId("annotate-name").focus(); })],
   ...(state.annotations?.own == null ? [] : AGAINST.map(([value, words]) => [`Score against ${words}`, "", edits(() => { toTab("scores")(); scoreAgainst(value); })])),
   ["Upload a recording", "", edits(async () => { await openSources(); byId("upload-choose").focus(); })],
   ["Topics and mounting of a recording or robot", "", edits(async () => { await openSources(); byId("source-uri").value ||= state.status?.source ?? ""; byId("source-inside").open = true; })],
-  ...(byId("robots-link") ? [["All robots: one card each, and one common map", "", () => byId("robots-link").click()]] : []),
   ...(byId("warnings-button").hidden ? [] : [["Show the warnings", "", () => byId("warnings-button").click()]]),
 ];
 
@@ -83,8 +77,6 @@ export function presentActions() {
   const speeds = [...byId("speed").options].map(({ value, text }) => [`Speed ${text}`, "", edits(() => attempted(() => command("set_speed", { factor: Number(value) })))]);
   const parameters = tuning.specs.map(({ name, stage, title, doc }) =>
     [`${stage}: ${title} (${shown(state.parameters?.values[name], specOf(name))}${isChanged(name) ? ", changed" : ""})`, "", () => openParameter(name), `setting ${name} ${doc} ${ALSO[name] ?? ""}`]);
-  const sensitivities = tuning.specs.filter(({ kind }) => kind !== "name").map((spec) =>
-    [`Sensitivity of ${spec.title} (${spec.stage})`, "", edits(() => { openParameter(spec.name); requestSensitivity(spec); }), `${spec.name} how much does it matter ∿`]);
   const found = trees().map(({ number }) => [`Tree ${number}`, "", () => { openDrawer(); openStory("tree"); select(number); }]);
-  return [...tabs, ...panels(), ...charts(), ...layers, ...views(), ...sets, ...speeds, ...parameters, ...found, ...sensitivities];
+  return [...tabs, ...panels(), ...charts(), ...layers, ...views(), ...sets, ...speeds, ...parameters, ...found, ...ofExtensions("presentActions")];
 }

@@ -5,12 +5,11 @@ import { nothingYet } from "../core/empty_state.js";
 import { count } from "../core/format.js";
 import { isCloud, on, state } from "../core/store.js";
 import { counted, verdictOf } from "../core/verdicts.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { openTab } from "../shell/tabs.js";
 import { forget, isChanged, isTuning, nameProblem, redo, refuse, reset, save, savedSets, specOf, takeFile, tuning, undo, use } from "./parameters.js";
 import { startWholeRun, wholeRun } from "./remap_status.js";
 import { rowOf } from "./row.js";
-import { searchPart, startSearch } from "./search.js";
-import { sensitivityButton, startSensitivity } from "./sensitivity.js";
 
 const LARGEST_FILE = 100_000;
 const MAIN = "Main parameters";
@@ -54,12 +53,12 @@ function build() {
     el("div", { class: "tune-effect" }, counts, wholeRun),
     el("div", { id: "tune-rows" }, ...parts),
     el("p", { id: "tune-none", class: "empty", hidden: true }),
-    el("details", { class: "tune-part" }, el("summary", { text: "Search for better values" }), searchPart));
+    ...ofExtensions("tuneParts"));
   show();
 }
 
 function groupOf(stage, specs) {
-  for (const spec of specs) rows.set(spec.name, rowOf(spec, ...(spec.kind === "name" ? [] : [sensitivityButton(spec)])));
+  for (const spec of specs) rows.set(spec.name, rowOf(spec, ...ofExtensions("parameterButtons", spec)));
   const changedCount = el("small");
   const group = el("details", { "data-stage": stage }, el("summary", {}, stage, changedCount), ...specs.map(({ name }) => rows.get(name).node));
   group.open = stage === MAIN;
@@ -192,8 +191,6 @@ export const openSearch = () => { openTab("tune"); byId("tune-find")?.focus(); }
 
 export function startTunePanel() {
   startWholeRun();
-  startSensitivity();
-  startSearch();
   on("specs", build);
   on("parameters sets", () => isTuning() && show());
   on("tuning", showError);
@@ -261,7 +258,7 @@ function arrange(parent, entries) {
   const now = entries.map(({ node }) => node).sort((a, b) => (a.compareDocumentPosition(b) & Node.DOCUMENT_POSITION_FOLLOWING ? -1 : 1));
   if (order.every(({ node }, k) => node === now[k])) return;
   for (const { node } of order) {
-    const below = node.nextElementSibling?.matches(".sensitivity") ? [node.nextElementSibling] : [];
+    const below = node.nextElementSibling?.matches(".below-row") ? [node.nextElementSibling] : [];
     parent.append(node, ...below);
   }
 }

@@ -24,7 +24,6 @@ from app.sources.request import SourceRequest, request_of_kept
 from app.store.database import maps
 from app.store.records import Author, Content
 from app.store.store import Store
-from app.training.examples import annotated_run
 from app.worker.protocol import Begin, Open, Shown, View
 from pipeline.errors import SourceError, StemmapError
 from pipeline.types.records import TruthTrees
@@ -213,7 +212,7 @@ def test_the_choices_of_a_run_without_a_browser_are_kept_as_well():
     assert source_request(Namespace(seed=5, topics=[], mount=None), "fake:").kept_choices() is None
 
 
-async def test_learning_uses_topics_mounting_seed_and_odometry_of_the_mapped_run(both: Running) -> None:
+async def test_annotations_keep_topics_mounting_seed_and_odometry_of_the_mapped_run(both: Running) -> None:
     _, dashboard = both
     wanted = Open("fake:", "static", 7, {"scan": "/other"}, (0.0, 0.1, 2.0, 0.0, 0.0, 0.5))
     await play(dashboard, wanted=wanted)
@@ -226,7 +225,6 @@ async def test_learning_uses_topics_mounting_seed_and_odometry_of_the_mapped_run
         wanted.request(), preset=state.preset, parameters=state.parameters.flat()
     )
     assert source.request == expected
-    assert annotated_run(source).request == source.request
 
 
 async def test_rejected_trees_do_not_count_in_the_list_and_are_marked_in_the_map(both: Running) -> None:

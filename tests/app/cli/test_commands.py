@@ -14,9 +14,11 @@ from pathlib import Path
 import pytest
 
 from app.cli import COMMANDS, _check_command, flags, main
+from app.cli import map as map_command
 from app.common.text import COMPILING
 from pipeline.config import PRESETS, field_specs, from_toml, preset
 from pipeline.jit import on_compiling, others_compile
+from pipeline.odometry.lidar_odometry import LOST
 
 RUN = "sim:paper?duration=2"
 
@@ -194,7 +196,6 @@ def test_a_file_of_parameters_that_does_not_fit_is_named(capsys, tmp_path, conte
         ("sim:paper?speed=3", 2, "speed"),
         ("sim:paper?duration=x", 2, "duration"),
         ("none.mcap", 1, "no such file"),
-        ("dds:robot", 1, "no address"),
         ("ftp://host/x", 2, "ftp"),
         ("x\0y", 1, "no such file"),
     ],
@@ -521,3 +522,8 @@ def test_the_program_ends_with_the_code_and_all_it_said(tmp_path, library):
     told = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (told.returncode, told.stderr) == (0, "")
     assert told.stdout.startswith("stemmap")
+
+
+@pytest.mark.parametrize(("warning", "code"), [(f"{LOST} since 1.2 s: no scan fits", 3), ("of no harm", 0)])
+def test_a_map_whose_odometry_got_lost_ends_with_exit_code_3(warning, code, tmp_path):
+    assert map_command._tell([], tmp_path, [warning], {}, replaces=False) == code

@@ -160,28 +160,6 @@ def test_the_confirmation_shows_where_the_map_is(run, capsys):
         assert ", by hand" in told
 
 
-@pytest.mark.parametrize(
-    ("how", "method", "words"),
-    [
-        ("by hand", "hand", "hand"),
-        ("the coordinates of the file", "file", "the coordinates of the file"),
-        ("3 control points, 0.010 m (RMS)", "", "3 control points, 0.010 m (RMS)"),
-    ],
-)
-def test_a_file_of_an_earlier_version_states_the_method_as_text(run, capsys, how, method, words):
-    stemmap(capsys, "georeference", run, "--by-hand", "391000,5819000,0", "--crs", "EPSG:25833")
-    file = run / "georeference.json"
-    record = json.loads(file.read_text()) | {"how": how}
-    for name in ("place", "method", "numbers"):
-        del record[name]
-    file.write_text(json.dumps(record))
-    assert stemmap(capsys, "georeference", run).out.endswith(f"to north, by {words}\n")
-    frame = read_map_frame(run)
-    assert frame.method == method
-    file.write_text(json.dumps(frame.record()))
-    assert read_map_frame(run) == frame
-
-
 def test_an_unknown_method_is_refused(run, capsys):
     stemmap(capsys, "georeference", run, "--by-hand", "391000,5819000,0", "--crs", "EPSG:25833")
     file = run / "georeference.json"

@@ -31,7 +31,7 @@ def test_robots_are_recorded_to_the_file_that_was_named(tmp_path: Path):
         (asked("x"), ("sim:stand",), "live robot"),
         (asked("x"), (ROBOT, "run.mcap"), "live robot"),
         (asked(publish=True), (SENSOR,), "only over Zenoh"),
-        (asked(publish=True), ("dds:?domain=1",), "only over Zenoh"),
+        (asked(publish=True), ("velodyne:127.0.0.1:2368",), "only over Zenoh"),
     ],
 )
 def test_what_cannot_be_recorded_or_published_is_refused(

@@ -26,7 +26,8 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         "STEMMAP_FILES": "folders",
         "STEMMAP_UPLOAD_GB": "2.5",
     }
-    assert set(given) == set(VARIABLES)
+    of_extensions = {"STEMMAP_EXTENSIONS"}  # read by app.extension
+    assert set(given) | of_extensions == set(VARIABLES)
     assert from_environment(given) == Settings(
         "localhost",
         9000,

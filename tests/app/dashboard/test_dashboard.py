@@ -196,8 +196,34 @@ async def test_flags_that_do_not_fit_another_preset_leave_what_is() -> None:
         return suggested, preset(suggested)
 
     state = ParameterState(begin)
-    assert not state.suit("paper")
+    state.suit("paper")
     assert state.preset == "forest"
+
+
+async def test_values_that_were_undone_or_reset_do_not_stick_to_the_next_source() -> None:
+    for back in (ParameterState.undo, lambda state: state.reset([])):
+        state = ParameterState()
+        state.suit("laser2d")
+        state.change({"clustering.eps": 0.3})
+        back(state)
+        state.suit("forest")
+        assert (state.preset, state.parameters) == ("forest", preset("forest"))
+        assert state.as_plain()["unsuited"] == ""
+
+
+async def test_a_preset_for_another_kind_of_sensor_is_said_until_it_is_replaced() -> None:
+    state = ParameterState()
+    state.suit("laser2d")
+    state.change({"clustering.eps": 0.3})
+    assert state.as_plain()["unsuited"] == ""
+    state.suit("forest")
+    assert (state.preset, state.as_plain()["unsuited"]) == ("laser2d", "forest")
+    state.use_preset("paper")  # also for scans of a 3D LiDAR
+    assert state.as_plain()["unsuited"] == ""
+    state.suit("stems")
+    assert (state.preset, state.as_plain()["unsuited"]) == ("paper", "stems")
+    state.use_preset("stems")
+    assert state.as_plain()["unsuited"] == ""
 
 
 async def test_a_picture_goes_to_scene_and_browsers_with_its_whole_path(dashboard: Dashboard) -> None:

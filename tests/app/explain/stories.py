@@ -28,6 +28,7 @@ GATHERED = ColumnStory(
     by_votes=True,
     present=9,
     absent=1,
+    absent_lately=0,
     viewed=4.0,
     effects=[FeatureEffect("tilt", 0.01, 0.2)],
 )

@@ -34,8 +34,8 @@ def column(forest: Forest, top: float, thick: float) -> Columns:
     verdict = np.array([CLASSES[int(share[0].argmax())]], np.int32)
     rays = np.zeros((1, 1), np.int32)
     return Columns(
-        np.zeros((1, 2), np.int64), np.zeros((1, 5)), np.full(1, 6.0), np.full(1, 4.0), np.zeros(1),
-        rays, rays, figures, share, verdict,
+        np.zeros((1, 2), np.int64), np.zeros((1, 5)), np.full(1, 6.0), np.full(1, 4.0),
+        np.zeros(1), np.zeros(1), rays, rays, figures, share, verdict,
     )  # fmt: skip
 
 

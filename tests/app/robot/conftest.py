@@ -18,7 +18,6 @@ from app.robot.source import LiveSource, open_live
 from pipeline.geometry.poses import Pose3
 from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.types.records import Odometry, Record, Scan, Sensor
-from tests.app.robot.fast_dds import compiled
 
 ROOT = Path(__file__).resolve().parents[3]
 SCANS, POINTS = 15, 30_000
@@ -95,16 +94,17 @@ def free_port() -> int:
 
 
 def clouds(scans: int, points: int = POINTS, period_ns: int = 100_000_000) -> Iterator[Record]:
-    """A robot that drives at 1 m/s through random points, with odometry at 50 Hz."""
+    """A robot that drives at 1 m/s through random points of 16 rings, with odometry at 50 Hz."""
     rng = np.random.default_rng(7)
     table = rng.uniform(-20.0, 20.0, (points, 3)).astype(np.float32)
     ring = (np.arange(points) % 16).astype(np.int32)
+    table[:, 2] = np.hypot(table[:, 0], table[:, 1]) * np.tan(np.radians(2.0 * ring - 15.0))
     for k in range(scans):
         for part in range(5):
             stamp = START_NS + k * period_ns + part * period_ns // 5
             yield Odometry(stamp, Pose3.from_euler([1e-9 * (stamp - START_NS), 0.0, 0.0], 0.0, 0.0, 0.0))
             if part == 0:
-                yield Scan(stamp, np.roll(table, k, axis=0), np.full(points, k, np.float32), ring)
+                yield Scan(stamp, np.roll(table, k, axis=0), np.full(points, k, np.float32), np.roll(ring, k))
     yield Odometry(START_NS + scans * period_ns, Pose3.from_euler([0.1 * scans, 0.0, 0.0], 0.0, 0.0, 0.0))
 
 
@@ -141,9 +141,3 @@ def robots(router: int, drive: Path) -> Iterator[Callable[[str], Robot]]:
     yield start
     for robot in started:
         robot.kill()
-
-
-@pytest.fixture(scope="session")
-def fast_dds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program of `tests.app.robot.fast_dds.Peer`."""
-    return compiled(tmp_path_factory.mktemp("fastdds"))

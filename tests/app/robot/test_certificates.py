@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from app.fleet import address_of
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.source import LiveSource, open_live
 from app.robot.zenoh import configuration, data_key
@@ -139,6 +138,3 @@ def test_what_is_wrong_with_the_files_is_said(folder: Path):
         parse_address(here.replace("tls/", "tcp/"))
     router = parse_address(f"{here}&cert={folder}/stemmap.pem&key={folder}/stemmap-key.pem")
     assert isinstance(router, ZenohAddress)
-    of_one = parse_address(address_of(router, "red"))
-    assert isinstance(of_one, ZenohAddress)
-    assert of_one.files == router.files

@@ -18,10 +18,11 @@ from hypothesis import strategies as st
 from app.robot.link import SKIPPED
 from app.robot.velodyne import NO_DATA, OTHERS, Sweeps
 from pipeline.io.readers import SourceOptions, open_source
+from pipeline.io.readers.capture import find_packets
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import ArrivalReader
 from pipeline.io.readers.topics import VELODYNE_SCAN, standard_types
-from pipeline.io.readers.velodyne import PACKET_BYTES, find_packets, is_data_packet
+from pipeline.io.readers.velodyne import PACKET_BYTES, is_data_packet
 from pipeline.types.records import Record, Scan
 from tests.app.robot.conftest import free_port, listening, until
 

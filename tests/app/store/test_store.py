@@ -251,38 +251,14 @@ def spoil(path: Path, statement: str) -> None:
         connection.commit()
 
 
-EARLIER = {
-    "UPDATE alembic_version SET version_num = '0005'": [
-        "ALTER TABLE annotations DROP COLUMN plot",
-        "ALTER TABLE run_maps DROP COLUMN files",
-        "ALTER TABLE run_records DROP COLUMN lost",
-    ],
-    "UPDATE alembic_version SET version_num = '0006'": ["ALTER TABLE run_records DROP COLUMN lost"],
-}
-
-
-@pytest.mark.parametrize("version", EARLIER)
-def test_tables_of_earlier_versions_get_the_columns_that_they_miss(tmp_path: Path, version):
-    store = Store(tmp_path)
-    run = store.open_run("d", "u", "n")
-    store.add(run, ANN, [Content(1.0, 2.0)])
-    store.close()
-    for statement in [*EARLIER[version], version]:
-        spoil(tmp_path / FILE_NAME, statement)
-    with contextlib.closing(Store(tmp_path)) as store:
-        (row,) = store.annotations(run)
-        assert (row.content.x, row.content.plot) == (1.0, None)
-        assert store.book.listed() == []
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
         (lambda path: path.write_bytes(b"no database" * 400), "not a database"),
         (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "malformed|damaged"),
-        (lambda path: spoil(path, "UPDATE alembic_version SET version_num = '9999'"), "newer stemmap"),
-        (lambda path: spoil(path, "UPDATE alembic_version SET version_num = '0003'"), "older stemmap"),
-        (lambda path: spoil(path, "DROP TABLE alembic_version"), "another program"),
+        (lambda path: spoil(path, "PRAGMA user_version = 9999"), "newer stemmap"),
+        (lambda path: spoil(path, "PRAGMA user_version = 3"), "older stemmap"),
+        (lambda path: spoil(path, "PRAGMA user_version = 0"), "another program"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_line_and_kept(tmp_path: Path, damage, words):

@@ -49,8 +49,8 @@ from tests.app.server_for_tests import (
 ROUTES = [
     ("GET", "/"),
     ("GET", "/runs"),
-    ("GET", "/robots"),
     ("GET", "/api/access"),
+    ("GET", "/api/extensions"),
     ("DELETE", "/api/access/viewer-link"),
     ("GET", "/static/plotly.min.js"),
     ("GET", "/static/index.html"),
@@ -73,20 +73,8 @@ ROUTES = [
     ("GET", "/api/sets"),
     ("POST", "/api/sets"),
     ("POST", "/api/sets/use"),
-    ("GET", "/api/search"),
-    ("POST", "/api/search"),
-    ("POST", "/api/search/stop"),
-    ("POST", "/api/search/go-on"),
-    ("POST", "/api/search/use"),
-    ("POST", "/api/search/save"),
     ("GET", "/api/doubts"),
     ("GET", "/api/course"),
-    ("GET", "/api/learning"),
-    ("POST", "/api/learning"),
-    ("POST", "/api/learning/use"),
-    ("DELETE", "/api/learning"),
-    ("POST", "/api/sensitivity"),
-    ("DELETE", "/api/sensitivity"),
     ("POST", "/api/sets/delete"),
     ("POST", "/api/sets/upload"),
     ("GET", "/api/sets/{name}.toml"),
@@ -253,11 +241,11 @@ async def test_who_may_look_changes_nothing(client: httpx.AsyncClient, who: dict
 async def test_the_viewers_link_becomes_a_cookie_that_looks(client: httpx.AsyncClient) -> None:
     link = (await client.get("/api/access", headers=BEARER)).json()
     viewer_link = f"/?token={viewer_token(TOKEN)}"
-    assert link == {"role": "owner", "viewer_link": viewer_link, "viewers": 0, "robots": None}
+    assert link == {"role": "owner", "viewer_link": viewer_link, "viewers": 0}
     answer = await client.get(link["viewer_link"])
     assert answer.status_code == 303
     cookie = {"Cookie": answer.headers["set-cookie"].split(";")[0]}
-    looks = {"role": "viewer", "viewer_link": None, "viewers": None, "robots": None}
+    looks = {"role": "viewer", "viewer_link": None, "viewers": None}
     assert (await client.get("/api/access", headers=cookie)).json() == looks
     assert viewer_token(viewer_token(TOKEN)) not in (TOKEN, viewer_token(TOKEN))
     # Who has both may do what the stronger one may.

@@ -607,19 +607,18 @@ async def test_a_command_while_the_worker_restarts_is_answered_503(both: Running
     assert (answer.status_code, answer.headers["Retry-After"]) == (503, "3")
 
 
-async def test_of_two_quick_opens_the_last_is_open(both: Running, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_of_two_quick_opens_the_last_is_open(both: Running) -> None:
     _, dashboard = both
-    leave, entered, go = dashboard.search.leave, asyncio.Event(), asyncio.Event()
+    entered, go = asyncio.Event(), asyncio.Event()
 
     async def slow_leave() -> None:
         entered.set()
         await go.wait()
-        await leave()
 
-    monkeypatch.setattr(dashboard.search, "leave", slow_leave)
+    dashboard.leaving.append(slow_leave)
     first = asyncio.create_task(dashboard.open(Open("a:")))
     await entered.wait()
-    monkeypatch.setattr(dashboard.search, "leave", leave)
+    dashboard.leaving.remove(slow_leave)
     second = asyncio.create_task(dashboard.open(Open("b:")))
     await asyncio.sleep(0)
     go.set()

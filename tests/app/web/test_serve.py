@@ -48,7 +48,8 @@ class Server:
 
 
 async def start(*words: str) -> asyncio.subprocess.Process:
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("STEMMAP_")}
+    own = ("STEMMAP_FOLDER",)  # that of the tests, and not of the user who runs them
+    environment = {k: v for k, v in os.environ.items() if k in own or not k.startswith("STEMMAP_")}
     return await asyncio.create_subprocess_exec(
         sys.executable,
         "-c",

@@ -17,7 +17,7 @@ from tests.benchmarks.package_forest import DATA, REACH, STREET, training_exampl
 from tests.benchmarks.table import Cell, Table
 
 if TYPE_CHECKING:
-    from app.training.examples import Examples
+    from app.extensions.learning.examples import Examples
     from pipeline.classification.forest import Forest
     from pipeline.inventory.terrain_raster import TerrainRaster
     from pipeline.types.records import CloudDescription, Float, Float32, WholeCloud
@@ -29,6 +29,9 @@ PARKS = (("00",), ("02",), ("03",), ("04", "07"), ("06",))
 TRAINING_SEEDS = range(3)
 RESAMPLES = 10_000
 CUT = 4.0  # m; height above the ground at which clouds are cut off
+LOW_CUTS = (3.0, 2.5, 2.0)  # m; phones and tablets see stems up to there
+THINNED = 0.3  # share of the points
+THINNING_SEEDS = (0, 1)
 SPREAD = 4.0  # cm; the reference DBH of a stem counts where the tools agree to this
 MATCH = 0.5  # m
 
@@ -55,7 +58,7 @@ def run() -> list[Table]:
 
     if not (DATA / "park_trunks").is_dir():
         raise StemmapError("there is no real data", where=str(DATA), remedy="Set STEMMAP_DATA")
-    return [_detection(), _whole_clouds(), _tape()]
+    return [_detection(), _whole_clouds(), _low_clouds(), _tape()]
 
 
 def _detection() -> Table:
@@ -160,11 +163,14 @@ def _fitted_without(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CutCloud:
-    """A whole cloud without the points from a height above the ground on [m]."""
+    """A whole cloud without the points from a height above the ground on [m], and of the others a share that
+    is drawn at random."""
 
     cloud: WholeCloud
     ground: TerrainRaster
     height: float
+    share: float = 1.0
+    seed: int = 0
 
     @property
     def description(self) -> CloudDescription:
@@ -178,10 +184,14 @@ class CutCloud:
 
     def parts(self) -> Iterator[Float32]:
         """See WholeCloud."""
+        import numpy as np
+
         from pipeline.inventory.terrain_raster import heights_above
 
+        rng = np.random.default_rng(self.seed)
         for part in self.cloud.parts():
-            yield part[heights_above(part, self.ground) < self.height]
+            drawn = part[rng.random(len(part)) < self.share]
+            yield drawn[heights_above(drawn, self.ground) < self.height]
 
 
 def _whole_clouds() -> Table:
@@ -208,6 +218,47 @@ def _whole_clouds() -> Table:
         "at this height above the ground."
     )
     return Table("Stems of whole clouds", columns, tuple(rows), (note,))
+
+
+def _low_clouds() -> Table:
+    """Clouds that end at 2 to 4 m, thinned clouds, and both, compared with the map of the whole cloud."""
+    import numpy as np
+
+    from pipeline.config import preset
+    from pipeline.evaluation import match
+    from pipeline.inventory import map_plot
+    from pipeline.io.readers.clouds import open_cloud
+
+    rows = list[tuple[Cell, ...]]()
+    for name in ("pine_plot", "LPine1", "MLS_Clip"):
+        cloud = open_cloud(str(next((DATA / "forest").glob(f"{name}*.laz"))))
+        whole = map_plot(cloud, preset("forest"))
+        cuts = (np.inf, CUT, *LOW_CUTS)
+        variants = [(cut, 1.0, 0) for cut in cuts[1:]]
+        variants += [(cut, THINNED, seed) for seed in THINNING_SEEDS for cut in cuts]
+        for cut, share, seed in variants:
+            mapped = map_plot(CutCloud(cloud, whole.ground, cut, share, seed), preset("forest"))
+            of = match(mapped.trees.position, whole.trees.position, MATCH)
+            wider = 100.0 * (mapped.trees.dbh[of >= 0] - whole.trees.dbh[of[of >= 0]])
+            wider = wider[np.isfinite(wider)]
+            rms = float(np.sqrt(np.mean(wider**2))) if len(wider) else None
+            rows.append((
+                name, None if np.isinf(cut) else cut, f"{100.0 * share:.0f} %", seed, int((of >= 0).sum()),
+                len(whole.trees.number), int((of < 0).sum()), len(wider), rms,
+            ))  # fmt: skip
+    columns = (
+        "cloud",
+        "cut [m]",
+        "points",
+        "seed",
+        "found",
+        "of",
+        "others",
+        "DBH",
+        "DBH RMS difference [cm]",
+    )
+    note = "Of: trees of the whole cloud at full density. Others: trees that are not among these."
+    return Table("Stems of whole clouds that are cut off low and thinned", columns, tuple(rows), (note,))
 
 
 def _tape() -> Table:

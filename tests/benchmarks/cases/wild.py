@@ -27,7 +27,7 @@ def run() -> list[Table]:
     """Twenty stands."""
     rows, scores, on = list[tuple[Cell, ...]](), list["MapScores"](), Counter[str]()
     for seed in chosen_seeds(SEEDS):
-        row, score, false = _mapped(seed)
+        row, score, false = mapped(f"sim:wild?seed={seed}", seed)
         rows.append(row)
         scores.append(score)
         on += false
@@ -49,8 +49,9 @@ def run() -> list[Table]:
     return [Table(LINE, columns, tuple(rows), (f"False trees are at: {kinds}.",))]
 
 
-def _mapped(seed: int) -> tuple[tuple[Cell, ...], MapScores, Counter[str]]:
-    """One stand: its row, its scores, and what is nearest to its false trees."""
+def mapped(uri: str, seed: int) -> tuple[tuple[Cell, ...], MapScores, Counter[str]]:
+    """One stand by its URI: its row, which begins with the seed, its scores, and what is nearest to its false
+    trees."""
     import numpy as np
 
     from pipeline.config import preset
@@ -60,7 +61,7 @@ def _mapped(seed: int) -> tuple[tuple[Cell, ...], MapScores, Counter[str]]:
     from pipeline.odometry.synchroniser import steps
 
     parameters = preset("forest")
-    with closing(open_simulated(f"sim:wild?seed={seed}")) as source:
+    with closing(open_simulated(uri)) as source:
         about, truth = source.description, source.truth()
         mapper = Mapper(parameters, sensor=about.sensor, T_base_lidar=about.T_base_lidar, seed=0)
         frame = [mapper.process(step) for step in steps(source.records())][-1]

@@ -1,6 +1,6 @@
 """The random forest of the package: its training examples, and its fit to them.
 
-`stemmap bench holdout` fits forests to the same examples without the place that it scores.
+`python -m tests.benchmarks holdout` fits forests to the same examples without the place that it scores.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from app.common.settings import data_folder
-from app.training.examples import Examples, stored_or_computed
+from app.extensions.learning.examples import Examples, stored_or_computed
 from pipeline.config import preset
 from pipeline.errors import StemmapError
 from tests.benchmarks.package_forest.augmentation import FOLDER, copies
@@ -25,7 +25,8 @@ from tests.benchmarks.package_forest.labelled_scenes import (
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 PARKS = ("00", "02", "03", "04", "07", "06")
 STREET = DATA / "semantickitti" / "000000.bin"
-STAND_SEEDS, STREET_SEEDS, WILD_SEEDS, EVERY = range(11, 17), range(200, 240), range(200, 224), 4
+STAND_SEEDS, UPRIGHT_SEEDS, EVERY = range(11, 17), range(31, 37), 4
+STREET_SEEDS, WILD_SEEDS = range(200, 240), range(200, 224)
 REACH = 25.0  # m
 COPIES = 8  # of each park scene with pasted things
 
@@ -35,9 +36,9 @@ def training_examples(names: Sequence[str] = PARKS) -> tuple[list[Examples], lis
     folder, or in the folder STEMMAP_EXAMPLES. `names` are the park scenes that are used."""
     kept = examples_folder()
     p, found = preset("forest"), list[Examples]()
-    for uri, furnished in _stands():
-        make = partial(stand_examples, uri, p, EVERY, furnished=furnished)
-        found += stored_or_computed(kept, stand_name(uri, furnished), make)
+    for uri, furnished, upright in _stands():
+        make = partial(stand_examples, uri, p, EVERY, furnished=furnished, upright=upright)
+        found += stored_or_computed(kept, stand_name(uri, furnished, upright), make)
     for seed in WILD_SEEDS:
         uri = f"sim:wild?seed={seed}&odometry=exact"
         found += stored_or_computed(kept, uri, partial(stand_examples, uri, p, EVERY))
@@ -61,9 +62,11 @@ def examples_folder() -> Path:
     return folder / "training"
 
 
-def _stands() -> Iterator[tuple[str, bool]]:
-    """The simulated stands; every second one has more objects that are not trees."""
+def _stands() -> Iterator[tuple[str, bool, bool]]:
+    """The simulated stands, and whether they have more objects that are not trees, which every second one
+    has, and stems without lean."""
     sigma = ("0.02", "0.03", "0.01")
-    for name in ("stand", "slope", "dense"):
-        for n, seed in enumerate(STAND_SEEDS):
-            yield f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}", n % 2 == 1
+    for seeds, upright in ((STAND_SEEDS, False), (UPRIGHT_SEEDS, True)):
+        for name in ("stand", "slope", "dense"):
+            for n, seed in enumerate(seeds):
+                yield f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}", n % 2 == 1, upright

@@ -14,6 +14,7 @@ from tests.benchmarks.package_forest import (
     STAND_SEEDS,
     STREET,
     STREET_SEEDS,
+    UPRIGHT_SEEDS,
     WILD_SEEDS,
     training_examples,
 )
@@ -29,9 +30,13 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="random seed (default: 0)")
     arguments = parser.parse_args()
     examples, pasted = training_examples(PARKS)
-    seeds = ",".join(map(str, STAND_SEEDS))
+    stands = [
+        f"sim:{name}, seeds {','.join(map(str, seeds))}{lean}, every second one furnished"
+        for seeds, lean in ((STAND_SEEDS, ""), (UPRIGHT_SEEDS, " without lean"))
+        for name in ("stand", "slope", "dense")
+    ]
     scenes = [
-        *(f"sim:{name}, seeds {seeds}, every second one furnished" for name in ("stand", "slope", "dense")),
+        *stands,
         f"sim:wild, {len(WILD_SEEDS)} seeds from {WILD_SEEDS[0]}",
         f"{len(STREET_SEEDS)} streets and parks",
         *(*PARKS, STREET.name),

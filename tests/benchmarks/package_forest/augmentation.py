@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.training.examples import Examples, stored_or_computed
+from app.extensions.learning.examples import Examples, stored_or_computed
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import open_source

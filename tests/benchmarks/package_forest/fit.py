@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from app.training.examples import TREE, UNKNOWN, Examples
-from app.training.fit_forest import (
+from app.extensions.learning.examples import TREE, UNKNOWN, Examples
+from app.extensions.learning.fit_forest import (
     FREE_END_SETTINGS,
     SETTINGS,
     ForestSettings,

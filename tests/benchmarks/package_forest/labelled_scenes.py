@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.training.examples import UNKNOWN, Examples
+from app.extensions.learning.examples import UNKNOWN, Examples
 from pipeline.classification import ColumnClassifier, ScanView, depth_image, steepest_by_direction
 from pipeline.classification.forest import CLASSES, DecisionTrees, Forest
 from pipeline.config import Parameters
@@ -59,6 +59,28 @@ class FurnishedStand(RunRequest):
         poles, standing, bushes, boxes, walking = FURNISHED[self.name]
         plain = super().scenario
         return replace(plain, poles=poles, standing=standing, bushes=bushes, boxes=boxes, walking=walking)
+
+
+class UprightStand(RunRequest):
+    """A run through a stand of stems without lean, which are as upright as its poles."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario without lean."""
+        return replace(super().scenario, lean=0.0)
+
+
+class FurnishedUprightStand(UprightStand, FurnishedStand):
+    """A run through a stand of FURNISHED with stems without lean."""
+
+
+# Requests by whether the stand is furnished, and whether its stems are upright.
+STANDS = {
+    (False, False): RunRequest,
+    (True, False): FurnishedStand,
+    (False, True): UprightStand,
+    (True, True): FurnishedUprightStand,
+}
 
 
 def columns_of(
@@ -115,7 +137,7 @@ def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: flo
 
 
 def stand_examples(
-    uri: str, parameters: Parameters, every: int, *, furnished: bool = False
+    uri: str, parameters: Parameters, every: int, *, furnished: bool = False, upright: bool = False
 ) -> Iterator[Examples]:
     """Yield the examples of a simulated run, with classes by its ground truth, see `columns_of` for their
     times.
@@ -125,19 +147,21 @@ def stand_examples(
         parameters: See `columns_of`.
         every: Only each scan whose number is a multiple of it is simulated.
         furnished: Whether objects that are not trees are added to the scene.
+        upright: Whether the stems have no lean.
     """
-    request = parse_uri(uri)
-    source = SimulatedSource(uri, open_run(FurnishedStand(*astuple(request)) if furnished else request))
+    request = STANDS[furnished, upright](*astuple(parse_uri(uri)))
+    source = SimulatedSource(uri, open_run(request))
     about, truth = source.description, source.run.true_trees()
     run, around = steps(source.records(every=every)), about.sensor.rings > 0
     for columns in columns_of(run, about.sensor, about.T_base_lidar, parameters):
         label = label_by_truth(columns.axis, truth)
-        yield Examples(stand_name(uri, furnished), True, around, columns.axis, columns.figures, label)
+        name = stand_name(uri, furnished, upright)
+        yield Examples(name, True, around, columns.axis, columns.figures, label)
 
 
-def stand_name(uri: str, furnished: bool) -> str:
+def stand_name(uri: str, furnished: bool, upright: bool) -> str:
     """Return the name of the scene of a simulated run."""
-    return f"furnished {uri}" if furnished else uri
+    return "upright " * upright + "furnished " * furnished + uri
 
 
 def label_by_truth(axis: Float, truth: TruthTrees) -> Int:

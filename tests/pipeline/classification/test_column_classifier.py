@@ -64,6 +64,17 @@ def test_a_trunk_is_a_tree_and_a_bush_is_none():
     assert columns.share.sum(axis=1) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.parametrize("radius", [0.07, 0.08])
+def test_an_upright_stem_without_visible_crown_is_a_tree_as_one_that_leans(radius):
+    votes = []
+    for lean in (0.0, np.tan(np.radians(1.7))):
+        columns = gathered(trunk(5.0, 1.0, radius, top=4.4, lean=lean, points=600), scans=3).columns
+        stem = at(columns, 5.0, 1.0)
+        assert columns.verdict[stem] == Verdict.TREE
+        votes.append(columns.share[stem, CLASSES.index(Verdict.TREE)])
+    assert votes[0] == pytest.approx(votes[1], abs=0.2)
+
+
 def test_nothing_gathered_is_no_column():
     assert len(gathered().columns.verdict) == 0
 

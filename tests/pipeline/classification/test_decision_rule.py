@@ -16,10 +16,15 @@ from pipeline.types.records import Verdict
 
 
 def verdict(
-    stopped: int, passed: int, height: float = 1.5, present: float = 0.0, absent: float = 0.0
+    stopped: int,
+    passed: int,
+    height: float = 1.5,
+    present: float = 0.0,
+    absent: float = 0.0,
+    lately: float = 0.0,
 ) -> Verdict:
     """The verdict of a column with all votes for a tree, by the rays that it stopped and let pass, and by the
-    scans in which it was present and absent."""
+    scans in which it was present and absent, and absent lately without a break."""
     met, through = np.zeros((1, SLICES), np.int32), np.zeros((1, SLICES), np.int32)
     met[0, int(height / SLICE)], through[0, int(height / SLICE)] = stopped, passed
     none = no_columns()
@@ -27,7 +32,7 @@ def verdict(
     one = replace(none, **rows)
     one.figures[0, NAMES.index("voxels to 3 m")] = 100.0
     one.share[0, CLASSES.index(Verdict.TREE)] = 1.0
-    one.present[0], one.absent[0] = present, absent
+    one.present[0], one.absent[0], one.absent_lately[0] = present, absent, lately
     return Verdict(int(column_votes(replace(one, met=met, passed=through)).verdict(0.4)[0]))
 
 
@@ -52,4 +57,10 @@ def test_rays_below_and_above_breast_height_do_not_matter():
 )
 def test_a_column_that_is_absent_in_most_scans_is_gone(present: int, absent: int, gone: bool):
     found = verdict(40, 0, present=present, absent=absent)
+    assert found is (Verdict.MOVING if gone else Verdict.TREE)
+
+
+@pytest.mark.parametrize(("lately", "gone"), [(11, False), (12, True)])
+def test_who_stood_long_is_gone_after_some_scans_without_them(lately: int, gone: bool):
+    found = verdict(40, 0, present=100, absent=20, lately=lately)
     assert found is (Verdict.MOVING if gone else Verdict.TREE)

@@ -9,8 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.training.examples import UNKNOWN, Examples
-from app.training.fit_forest import SETTINGS
 from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import (
     ALL_AROUND,
@@ -28,7 +26,7 @@ from pipeline.classification.forest import (
 )
 from pipeline.errors import StemmapError
 from pipeline.types.records import Verdict
-from tests.benchmarks.package_forest.fit import FittedForest, as_json, fit, fit_free_end
+from tests.pipeline.classification.figures import ending
 
 LEAF = {"share": [1.0, 0, 0, 0, 0, 0]}
 OTHER = {"share": [0, 0, 0, 0, 0, 1.0]}
@@ -93,12 +91,6 @@ def test_a_file_that_is_missing_too_large_or_no_json_is_refused(tmp_path):
         read_forest(file, ONE_WAY)
 
 
-def shares(fitted: FittedForest, figures):
-    """Votes of a fitted forest in the order of CLASSES, shape (N, classes)."""
-    leaf = fitted.trees.apply(figures[:, : fitted.trees.n_features_in_].astype(np.float32))
-    return np.mean([share[leaf[:, k]] for k, share in enumerate(fitted.share)], axis=0)
-
-
 def test_the_forest_of_the_package_votes_in_shares():
     figures = np.random.default_rng(0).uniform(-1.0, 5.0, (50, COUNT))
     for all_around in (True, False):
@@ -106,42 +98,6 @@ def test_the_forest_of_the_package_votes_in_shares():
         assert votes.sum(axis=1) == pytest.approx(1.0, abs=0.02)
         assert (votes >= 0.0).all()
     assert FILE.stat().st_size < 1_300_000
-
-
-def test_what_was_grown_votes_the_same_as_json():
-    rng = np.random.default_rng(1)
-    figures = rng.uniform(0.0, 1.0, (300, COUNT))
-    label = np.where(figures[:, 3] > 0.5, 0, 1 + (figures[:, 5] > 0.5))
-    label[:20] = UNKNOWN
-    examples = [
-        Examples("a", False, kind == ALL_AROUND, np.zeros((300, 5)), figures, label) for kind in SETTINGS
-    ]
-    for kind in SETTINGS:
-        grown = fit(examples, kind)
-        forest = forest_of(as_json({kind: grown}, []), kind)
-        ours, theirs = vote(figures.astype(np.float32).astype(np.float64), forest), shares(grown, figures)
-        # Thresholds are rounded to four digits: a figure that lies within the rounding may turn.
-        assert np.mean(np.abs(ours - theirs).max(axis=1) < 0.02) > 0.95
-        sure = label != UNKNOWN
-        assert np.mean((ours[sure, 0] >= 0.5) == (label[sure] == 0)) > 0.95
-
-
-def test_the_same_examples_grow_the_same_trees():
-    rng = np.random.default_rng(2)
-    figures = rng.uniform(0.0, 1.0, (100, COUNT))
-    examples = [
-        Examples("a", False, True, np.zeros((100, 5)), figures, (figures[:, 0] > 0.5).astype(np.int64))
-    ]
-    assert as_json({"k": fit(examples, ALL_AROUND)}, []) == as_json({"k": fit(examples, ALL_AROUND)}, [])
-
-
-def ending(top: float, free: float):
-    figures = np.zeros((1, COUNT))
-    figures[0, NAMES.index("highest return")], figures[0, NAMES.index("free above the highest return")] = (
-        top,
-        free,
-    )
-    return figures
 
 
 def test_what_ends_in_free_air_is_asked_whether_it_is_a_pole(tmp_path):
@@ -166,20 +122,6 @@ def test_sensors_that_see_all_around_and_older_files_ask_nobody(tmp_path):
     assert read_forest(written(tmp_path), ONE_WAY).free_end is None
     with pytest.raises(StemmapError, match="decision trees cannot be read"):
         read_forest(written(tmp_path, **{FREE_END: []}), ONE_WAY)
-
-
-def test_poles_that_end_in_free_air_are_told_by_what_was_pasted():
-    rng = np.random.default_rng(2)
-    figures = np.repeat(ending(3.0, 2.0), 200, axis=0)
-    figures[:, NAMES.index("thick")] = rng.uniform(0.0, 0.2, 200)
-    label = (figures[:, NAMES.index("thick")] < 0.1).astype(np.int64)
-    pasted = Examples("a with poles 0", True, False, np.zeros((200, 5)), figures, label)
-    grown = fit_free_end([pasted])
-    assert grown is not None
-    assert np.mean((shares(grown, figures)[:, 0] >= 0.5) == (label == 0)) > 0.95
-    assert fit_free_end([]) is None
-    low = Examples("a with poles 1", True, False, np.zeros((200, 5)), np.zeros((200, COUNT)), label)
-    assert fit_free_end([low]) is None
 
 
 TREE, NO_TREE = [1.0, 0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0, 0]

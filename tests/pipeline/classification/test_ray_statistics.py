@@ -67,11 +67,22 @@ def test_a_column_is_absent_where_the_free_range_ends_behind_it(free, present, a
     there = direction_bin(x, y, BINS)
     clear[there], steepest[there] = reach + free, 0.2
     for range_max, seen in ((reach + 0.1, True), (reach - 0.1, False)):
-        viewed, was, was_not = np.full(1, -1.0), np.zeros(1), np.zeros(1)
+        viewed, was, was_not, lately = np.full(1, -1.0), np.zeros(1), np.zeros(1), np.full(1, 3.0)
         update_visibility(
-            AXIS, viewed, was, was_not, pose, clear, steepest, np.array([0.0, 0.0, 1.0]), FLAT, range_max
+            AXIS,
+            viewed,
+            was,
+            was_not,
+            lately,
+            pose,
+            clear,
+            steepest,
+            np.array([0.0, 0.0, 1.0]),
+            FLAT,
+            range_max,
         )
         assert (was[0], was_not[0]) == ((present, absent) if seen else (0, 0))
+        assert lately[0] == ((0 if present else 3 + absent) if seen else 3)
         assert viewed[0] == pytest.approx(0.2 * reach + 1.0 if seen else -1.0)
 
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from pipeline.config import (
     PRESETS,
     Parameters,
-    RenamedParameterWarning,
     assign,
     field_specs,
     from_toml,
@@ -308,36 +307,3 @@ def test_the_table_has_a_row_per_parameter_and_a_column_per_preset():
 def test_values_are_plain_python_numbers():
     for value in preset("forest").replace({"clustering.eps": np.float64(0.3)}).flat().values():
         assert type(value) in (int, float, bool, str)
-
-
-def test_a_removed_parameter_is_ignored_with_one_warning():
-    with pytest.warns(RenamedParameterWarning, match=r"tracking.gate no longer exists") as warned:
-        assert preset("paper").replace({"tracking.gate": 2.0}) == preset("paper")
-    assert len(warned) == 1
-
-
-def test_a_removed_choice_is_replaced_with_one_warning():
-    with pytest.warns(RenamedParameterWarning, match="fastslam2 is used") as warned:
-        changed = preset("paper").replace({"slam.method": "graph"})
-    assert len(warned) == 1
-    with pytest.warns(RenamedParameterWarning, match="fastslam2 is used"):
-        from_file = from_toml('[slam]\nmethod = "graph"\n', Parameters(), "old.toml")
-    assert changed.slam.method == from_file.slam.method == "fastslam2"
-
-
-def test_names_of_earlier_versions_are_accepted_with_one_warning_each():
-    with pytest.warns(RenamedParameterWarning, match=r"gathering.range_max is now called classification"):
-        by_name = Parameters().replace({"gathering.range_max": 12.0})
-    with pytest.warns(RenamedParameterWarning, match=r"gathering.tree_share is now called classification"):
-        from_file = from_toml("[gathering]\ntree_share = 0.3\n", Parameters(), "old.toml")
-    with pytest.warns(RenamedParameterWarning, match=r"shape.slices"):
-        assigned = assign(Parameters(), ["shape.slices=6"])
-    assert by_name.classification.range_max == 12.0
-    assert from_file.classification.tree_share == 0.3
-    assert assigned.shape.split_slices == 6
-
-
-def test_a_current_name_takes_precedence_over_an_earlier_name():
-    with pytest.warns(RenamedParameterWarning):
-        p = from_toml("[shape]\nslices = 6\nsplit_slices = 8\n", Parameters(), "both.toml")
-    assert p.shape.split_slices == 8

@@ -11,6 +11,7 @@ from sklearn.cluster import DBSCAN
 
 from pipeline.config import preset
 from pipeline.detection.clustering import ENGINES, cluster, dbscan_grid, number_by_first_point, weigh
+from pipeline.types.records import Sensor
 from tests.pipeline.strategies import SENSOR, simulated_cloud
 
 FOREST = preset("forest").clustering
@@ -218,3 +219,16 @@ def test_a_far_thin_stem_is_a_cluster_and_the_paper_weighs_nothing():
     assert cluster(far, SENSOR, FOREST).clusters == 1
     assert cluster(far, SENSOR, FOREST.model_copy(update={"stem_area": 0.0})).clusters == 0
     assert preset("paper").clustering.stem_area == 0.0
+
+
+def test_a_coarse_sensor_does_not_cut_a_stem_between_two_of_its_lines():
+    """A Mid-360 crosses a stem of 0.5 m at 9 m by three lines, 0.18 m apart."""
+    height, across = np.meshgrid(np.arange(-0.5, 1.6, 0.14), [-0.18, 0.0, 0.18])
+    away = 9.0 - np.sqrt(0.25**2 - across**2)
+    stem = np.stack([away, across, height], axis=-1).reshape(-1, 3).astype(np.float32)
+    coarse = Sensor(azimuth_step=0.0183, ring_step=0.0183)
+    parameters = preset("forest").clustering
+    assert cluster(stem, coarse, parameters).clusters == 1
+    assert cluster(stem, Sensor(), parameters).clusters == 3
+    beside = np.concatenate([stem, stem + np.array([0.0, 1.0, 0.0], np.float32)])
+    assert cluster(beside, coarse, parameters).clusters == 2

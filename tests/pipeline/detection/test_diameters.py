@@ -21,9 +21,9 @@ ROUND_CONE = {"out_of_round": 0.0, "taper_sigma": 0.0}  # what simulated trunks 
 BREAST = preset("forest").tracking.breast_height
 
 
-def tracker(**changes: Any):
+def tracker(spacing: float = 0.0, **changes: Any):
     """With the parameters of the preset forest, but a diameter from any arc."""
-    return Tracker(preset("forest").tracking.model_copy(update={"dbh_arc_min": 0.0, **changes}))
+    return Tracker(preset("forest").tracking.model_copy(update={"dbh_arc_min": 0.0, **changes}), spacing)
 
 
 def show(t, k, distance, radius, sigma, height=BREAST):
@@ -44,6 +44,29 @@ def test_a_radius_weighs_by_its_variance_and_the_square_of_its_distance():
     distance, radius, sigma = np.array(views).T
     weight = (sigma * np.maximum(distance, 1.0)) ** -2.0
     assert t.trees().dbh[0] == pytest.approx(2.0 * np.average(radius, weights=weight))
+
+
+@pytest.mark.parametrize("spacing", [0.0035, 0.018])
+@pytest.mark.parametrize("distance", [4.0, 9.0, 16.0])
+@pytest.mark.parametrize("diameter", [0.1, 0.3, 0.6])
+def test_a_trunk_needs_two_distances_between_returns_for_a_diameter(
+    spacing: float, distance: float, diameter: float
+):
+    t = tracker(spacing)
+    for k in range(50):
+        show(t, k, distance, diameter / 2.0, 0.01)
+    found = t.trees()
+    if diameter < 2.0 * spacing * distance:
+        assert np.isnan(found.dbh[0])
+        assert np.isnan(found.dbh_sigma[0])
+    else:
+        assert found.dbh[0] == pytest.approx(diameter)
+        # An edge lies anywhere between two returns; patterns that do not repeat average half of this out.
+        assert (
+            0.5
+            < found.dbh_sigma[0] / np.hypot(0.37 * spacing * distance / np.sqrt(3.0), 0.025 * diameter)
+            < 2.0
+        )
 
 
 def test_more_scans_from_afar_do_not_make_a_diameter_surer_than_edges_are_known():

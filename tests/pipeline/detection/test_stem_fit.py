@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe
-from pipeline.detection.cylinder_fit import BEAM, angular_width, fit_stems
+from pipeline.detection.cylinder_fit import BEAM, angular_width, fit_one, fit_stems
 from pipeline.types.records import Labels, Sensor
 from tests.pipeline.strategies import SENSOR, arc, one_cluster
 
@@ -280,3 +280,20 @@ def test_the_angular_width_is_the_spread_about_the_mean_direction(seed, count, s
     assume(np.abs(turn).max() < np.pi - 1e-6)
     found = angular_width(np.vstack([ray.real, ray.imag, reach, np.zeros(count)]), count)
     np.testing.assert_allclose(found, [middle + (turn.max() + turn.min()) / 2, np.ptp(turn)], atol=1e-6)
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.08, 0.2])
+@pytest.mark.parametrize("away", [5.0, 8.0])
+def test_a_coarse_sensor_makes_no_stem_much_thicker_than_it_is_seen(radius: float, away: float):
+    """Returns of a LiDAR without rings, a degree apart, all over the visible side of a stem."""
+    rng = np.random.default_rng(1)
+    errors = []
+    for _ in range(20):
+        count = max(round(2.0 * radius * 2.5 / (0.0183 * away) ** 2), 8)
+        across = rng.uniform(-radius, radius, count)
+        depth = away - np.sqrt(radius**2 - across**2) + rng.normal(0.0, 0.02, count)
+        points = np.stack([depth, across * depth / away, rng.uniform(-0.5, 2.0, count)], axis=1)
+        fit = fit_one(points, Sensor(azimuth_step=0.0183, ring_step=0.0183))
+        assert fit is not None
+        errors.append(2.0 * (fit.radius - radius))
+    assert abs(float(np.median(errors))) < 0.05

@@ -66,7 +66,7 @@ def test_the_points_that_another_library_wrote(tmp_path, points, name, how, kind
     points = points[::2]
     file = write(tmp_path / name, points, how)
     cloud = open_cloud(str(file))
-    assert is_cloud(str(file)) == (name != "c.pcd")
+    assert is_cloud(str(file))
     assert (cloud.description.kind, cloud.description.points) == (kind, len(points))
     for _ in range(2):  # as often as asked for
         read = np.concatenate(list(cloud.parts()))
@@ -234,7 +234,7 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_read_is_one_line_and_leaves_no_folder(tmp_path, capsys, name):
     (tmp_path / name).write_bytes(REFUSED[name])
-    arguments = ["map", str(tmp_path / name), "--as", "plot", "--out", str(tmp_path / "out")]
+    arguments = ["map", str(tmp_path / name), "--as", "cloud", "--out", str(tmp_path / "out")]
     assert main(arguments) == 1
     told = capsys.readouterr().err
     assert told.count("\n") == 1, told
@@ -278,13 +278,6 @@ def test_a_cloud_is_mapped_driven_through_and_told_of_like_a_las_file(tmp_path, 
     assert opened.description.kind == "simulated drive through a whole cloud (PLY binary)"
 
 
-def test_one_pcd_file_is_a_scan_unless_it_is_called_a_plot(tmp_path, points):
-    file = write(tmp_path / "plot.pcd", points)
-    assert open_source(str(file)).description.scans == 1
-    assert main(["map", str(file), "--as", "plot", "--out", str(tmp_path / "out")]) == 0
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["trees"] == 9
-
-
 def test_tables_tell_what_they_hold_before_they_are_read(tmp_path, points):
     table = open_table(write(tmp_path / "c.ply", points))
     assert (table.points, table.names[:3]) == (len(points), ("x", "y", "z"))
@@ -303,3 +296,70 @@ def test_large_coordinates_are_reduced_by_whole_hundreds_of_metres(middle):
     assert (offset[small] == 0.0).all()
     assert (np.abs(middle - offset)[~small] <= 50.0).all()
     assert (np.remainder(offset, 100.0) == 0.0).all()
+
+
+def ply_with_lists(order: str, before: bool, points: np.ndarray, rng: np.random.Generator) -> bytes:
+    """A binary PLY file whose vertices have two lists, one before z; with an element of lists before them."""
+    form = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    head = f"ply\nformat {form} 1.0\n"
+    body = bytearray()
+    if before:
+        head += "element camera 7\nproperty float f\nproperty list uchar short name\n"
+        for k in range(7):
+            body += struct.pack(f"{order}fB{k}h", 1.5, k, *range(k))
+    head += (
+        f"element vertex {len(points)}\nproperty float x\nproperty double y\n"
+        "property list ushort int views\nproperty float z\nproperty list uchar double weights\n"
+        "property uchar red\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    counts = rng.integers(0, 5, (len(points), 2))
+    for k, ((x, y, z), (a, b)) in enumerate(zip(points.tolist(), counts.tolist(), strict=True)):
+        body += struct.pack(f"{order}fdH{a}ifB{b}dB", x, y, a, *range(a), z, b, *[0.5] * b, k % 256)
+    return head.encode() + bytes(body)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("before", [False, True])
+def test_ply_with_lists_in_and_before_its_vertices(tmp_path, order, before, monkeypatch):
+    monkeypatch.setattr("pipeline.io.readers.point_files._WALKED", 70_000)  # in several parts
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-9.0, 9.0, (5000, 3))
+    (tmp_path / "c.ply").write_bytes(ply_with_lists(order, before, points, rng))
+    cloud = open_cloud(str(tmp_path / "c.ply"))
+    assert cloud.description.attributes == ("red",)
+    for _ in range(2):
+        np.testing.assert_allclose(np.concatenate(list(cloud.parts())), points, atol=1e-5)
+    assert cloud.losses == {}
+
+
+def test_a_cut_or_damaged_ply_with_lists_gives_the_points_before(tmp_path):
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-9.0, 9.0, (500, 3))
+    whole = ply_with_lists("<", True, points, rng)
+    (tmp_path / "c.ply").write_bytes(whole[: len(whole) // 2])
+    cloud = open_cloud(str(tmp_path / "c.ply"))
+    read = np.concatenate(list(cloud.parts()))
+    assert 100 < len(read) < 400
+    np.testing.assert_allclose(read, points[: len(read)], atol=1e-5)
+    assert cloud.losses == {"points that the files promise but do not hold": 500 - len(read)}
+    for k in range(150):
+        content = bytearray(whole)
+        for at in rng.integers(0, 500 if k % 2 else len(content), 5):
+            content[at] = int(rng.integers(0, 256))
+        (tmp_path / "c.ply").write_bytes(bytes(content))
+        with suppress(SourceError):
+            assert sum(len(part) for part in open_cloud(str(tmp_path / "c.ply")).parts()) <= 500
+
+
+def test_ply_text_with_a_list_after_the_coordinates(tmp_path, points):
+    some = points[:2000]
+    head = TEXT.format(n=2000).replace("end_header", "property list uchar int views\nend_header")
+    lines = [f"{x:.4f} {y:.4f} {z:.4f} {k % 3}{' 5' * (k % 3)}" for k, (x, y, z) in enumerate(some)]
+    (tmp_path / "c.ply").write_text(head + "\n".join(lines))
+    read = np.concatenate(list(open_cloud(str(tmp_path / "c.ply")).parts()))
+    np.testing.assert_allclose(read, some, atol=1e-4)
+    (tmp_path / "c.ply").write_text(
+        head.replace("property float x\n", "property list uchar int views\nproperty float x\n")
+    )
+    with pytest.raises(SourceError, match=r"a list before x, y and z.*Export it"):
+        open_cloud(str(tmp_path / "c.ply"))

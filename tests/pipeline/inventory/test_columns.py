@@ -24,7 +24,7 @@ def test_a_column_is_found_in_a_cloud_of_more_than_a_million_voxels():
         np.zeros(2), 110.0, np.zeros((1, 1)), np.ones((1, 1), np.bool_), np.ones((1, 1), np.bool_)
     )
     points = np.concatenate([column, grass]).astype(np.float32)
-    axes, _ = strongest_first(list(find_columns(points, raster, np.full((1, 1), 6.0))))
+    axes, _, _ = strongest_first(list(find_columns(points, raster, np.full((1, 1), 6.0))))
     away = np.hypot(*(axes[:, :2] - (-5.0, -5.0)).T)
     assert away.min() < 0.2
 
@@ -38,7 +38,7 @@ def test_stems_without_a_model_are_repeated_only_at_the_same_place():
     for k, (x, radius, slices) in enumerate(rows):
         axes[k, 0], stems[k]["slices"] = x, slices
         if np.isfinite(radius):
-            stems[k] = (x, 0.0, 0.0, 0.0, radius, *[0.0] * 5, 0.4, 6.0, slices, *[0.0] * 6)
+            stems[k] = (x, 0.0, 0.0, 0.0, radius, *[0.0] * 6, 0.4, 6.0, slices, *[0.0] * 6)
     verdict = np.full(len(rows), Verdict.TOO_FEW_POINTS, np.int32)
     verdict[0] = Verdict.TREE
     assert is_repeated(stems, axes, verdict).tolist() == [False, True, False, False, True]

@@ -100,7 +100,7 @@ def test_bushes_stumps_and_hanging_branches_are_no_trees():
     parts = [ground(8.0, 0.05, rng), bush(2.0, 2.0, rng), stem(5.0, 5.0, 0.2, rng, height=0.9), hanging]
     m = map_plot(Made(np.concatenate(parts)), FOREST)
     assert len(m.trees.number) == 0
-    assert {Verdict.TOO_LOW, Verdict.OTHER} & set(m.verdict.tolist())
+    assert {Verdict.STUMP, Verdict.OTHER} & set(m.verdict.tolist())
 
 
 def test_undergrowth_at_the_foot_does_not_hide_a_stem():

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import SourceOptions
 from pipeline.io.readers.mounting import mounting_by_ground
 from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.lidar import SolidStateLidar, SpinningLidar
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, Author, Write, write_recording
+from tests.pipeline.io.velodyne_drive import open_drive, packets_of, write_capture
 
 
 def scan_of(scenario: str, lidar: SpinningLidar, mounting: Pose3) -> Scan:
@@ -86,3 +88,41 @@ def test_a_recording_without_transforms_says_how_its_lidar_is_tilted(
     (said,) = [text for text in known.warnings if "by the ground in the first scan" in text]
     assert (frame or "the LiDAR") in said
     assert "--mount" in said
+
+
+def test_captures_and_folders_of_scans_are_levelled_too(tmp_path: Path, opened: Opened):
+    true = mounted(0, 45)
+    run = open_drive("sim:stand?duration=2", 0.02, true)
+    write_capture(tmp_path / "drive.pcap", [packets_of(run, k) for k in range(2)])
+    (tmp_path / "scans").mkdir()
+    for k in range(2):
+        np.save(tmp_path / "scans" / f"{k:06d}.npy", run.sweep(k).scan.points)
+    for path in (tmp_path / "drive.pcap", tmp_path / "scans"):
+        described = opened(path).description
+        assert np.degrees(np.arccos(described.T_base_lidar.R[2] @ true.R[2])) < 6.0
+        assert any("tilted by 4" in warning for warning in described.warnings)
+        chosen = SourceOptions(T_base_lidar=mounted(0, 10))
+        assert opened(path, chosen).description.T_base_lidar == chosen.T_base_lidar
+
+
+def test_clutter_around_a_lidar_on_a_desk_is_no_ground():
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        beam = rng.normal(size=(8000, 3))
+        beam /= np.linalg.norm(beam, axis=1)[:, None]
+        beam[:, 2] *= 0.3  # rings of 17 degrees
+        reach = rng.choice([0.4, 0.7, 2.5, 6.0], size=(8000, 1)) * rng.uniform(0.7, 1.3, size=(8000, 1))
+        scan = Scan(0, (beam * reach).astype(np.float32))
+        assert mounting_by_ground(scan) is None
+
+
+@pytest.mark.parametrize("folder", ["velodyne/vlp16_rosbag2", "hesai/xt32", "hesai/40p"])
+def test_no_lidar_is_levelled_by_the_things_in_a_room(folder: str, shared_data: Path, opened: Opened):
+    here = shared_data / folder
+    inside = [path for path in here.iterdir() if path.is_dir()]
+    source = opened(inside[0] if inside else here)
+    assert not any("tilted" in text for text in source.description.warnings)
+    for record in source.records():
+        if isinstance(record, Scan):
+            assert mounting_by_ground(record) is None
+            assert mounting_by_ground(record, np.radians(6.0)) is None

@@ -45,6 +45,20 @@ def test_a_folder_of_data_sets_names_the_folders_that_can_be_opened(tmp_path: Pa
         open_source(str(tmp_path))
 
 
+def test_recordings_in_folders_beside_other_files_are_named(tmp_path: Path):
+    np.save(tmp_path / "scan.npy", np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32))
+    for name in ("drive", "notes"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "drive" / "drive_0.db3").touch()
+    source = open_source(str(tmp_path))
+    assert "not part of this run are drive/: open each of them by its name" in source.description.warnings
+    (tmp_path / "scan.npy").unlink()
+    for name in ("a.bag", "b.bag"):
+        (tmp_path / name).touch()
+    with pytest.raises(SourceError, match=r"Open what is in it: a\.bag, b\.bag, drive/\."):
+        open_source(str(tmp_path))
+
+
 def test_an_unknown_file_is_told(tmp_path: Path):
     path = tmp_path / "notes.txt"
     path.write_text("hello")

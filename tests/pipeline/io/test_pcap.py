@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +13,15 @@ import velodyne_decoder
 from scipy.spatial import cKDTree
 
 from pipeline.errors import SourceError
+from pipeline.io.readers.capture import find_packets
+from pipeline.io.readers.hesai import MODELS, SCAN_TYPES, HesaiModel
 from pipeline.io.readers.point_files import open_table, read_columns
-from pipeline.io.readers.velodyne import SENSORS, find_packets, is_data_packet
+from pipeline.io.readers.topics import standard_types
+from pipeline.io.readers.velodyne import SENSORS, is_data_packet
 from pipeline.types.records import Scan
 from tests.app.robot.test_velodyne import packet
 from tests.pipeline.io.conftest import Opened
+from tests.pipeline.io.test_hesai import decoded, turn
 
 
 def frames(capture: bytes) -> list[tuple[int, int, bytes]]:
@@ -125,7 +131,7 @@ def test_a_capture_of_other_traffic_is_refused(real: Path, tmp_path: Path, opene
         for s, f, frame in frames(real.read_bytes())
     ]
     path.write_bytes(capture_of(web))
-    with pytest.raises(SourceError, match="no data packets of a known Velodyne sensor"):
+    with pytest.raises(SourceError, match="no data packets of a known LiDAR"):
         opened(path)
 
 
@@ -168,9 +174,85 @@ def test_every_model_that_names_itself_is_read_as_that_model(
     path.write_bytes(capture_of(named))
     source = opened(path)
     scans = [record for record in source.records() if isinstance(record, Scan)]
-    assert source.description.sensor == SENSORS[product]
+    sensor = source.description.sensor
+    assert sensor == replace(SENSORS[product], range_sigma=sensor.range_sigma)
     assert scans
     for scan in scans:
         assert np.isfinite(scan.points).all()
         assert scan.ring is not None
         assert 0 <= scan.ring.min() <= scan.ring.max() < SENSORS[product].rings
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
+def test_a_capture_of_hesai_is_read(model: HesaiModel, tmp_path: Path, opened: Opened):
+    packets = turn(model)
+    step_us = 100_000 // len(packets)
+    times = [(1_764_000_000 + k * step_us // 10**6, k * step_us % 10**6) for k in range(3 * len(packets))]
+    path = tmp_path / "hesai.pcap"
+    path.write_bytes(
+        capture_of([(s, us, udp(each)) for (s, us), each in zip(times, packets * 3, strict=True)])
+    )
+    source = opened(path)
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    assert source.description.kind == "Hesai capture (pcap)"
+    assert source.description.sensor.name == f"Hesai {model.name}"
+    assert source.losses == {}
+    assert len(scans) == 3
+    expected = decoded(packets)
+    for scan in scans:
+        np.testing.assert_array_equal(scan.points, expected.points)
+        np.testing.assert_array_equal(scan.ring, expected.ring)
+
+
+def test_a_real_recording_of_hesai_as_a_capture_has_the_same_scans(
+    shared_data: Path, tmp_path: Path, opened: Opened
+):
+    folder = next(path for path in (shared_data / "hesai" / "xt32").iterdir() if path.is_dir())
+    database = sqlite3.connect(next(folder.glob("*.db3")))
+    store = standard_types("cdr")
+    frames_of_packets = []
+    for (payload,) in database.execute("select data from messages order by timestamp"):
+        for each in store.deserialize_cdr(payload, SCAN_TYPES[0]).packets:  # type: ignore[attr-defined]
+            content = each.data[: each.size].tobytes()
+            frames_of_packets.append((each.stamp.sec, each.stamp.nanosec // 1000, udp(content)))
+    database.close()
+    path = tmp_path / "xt32.pcap"
+    path.write_bytes(capture_of(frames_of_packets))
+    of_capture = scans_of(opened, path)
+    of_messages = scans_of(opened, folder)
+    assert len(of_capture) == len(of_messages) == 4
+    for ours, theirs in zip(of_capture, of_messages, strict=True):
+        np.testing.assert_array_equal(ours.points, theirs.points)
+        np.testing.assert_array_equal(ours.ring, theirs.ring)
+
+
+@pytest.mark.parametrize(
+    ("payload", "port", "name", "driver"),
+    [
+        (b"\x00" * 1300, 56301, "Livox", "livox_ros_driver2"),
+        (b"\x05\x00" * 700, 57000, "Livox", "livox_ros_driver2"),
+        (b"\x55\xaa\x05\x0a" + bytes(1244), 2368, "RoboSense", "rslidar_sdk"),
+        (b"\x55\xaa\x05\x5a" + bytes(1244), 6699, "RoboSense", "rslidar_sdk"),
+        (b"\xee\xff\x04\x03\x00\x00\x80\x02" + bytes(1110), 2368, "Hesai AT128", "hesai_ros_driver"),
+    ],
+)
+def test_a_capture_of_another_maker_is_refused_by_name(
+    payload: bytes, port: int, name: str, driver: str, tmp_path: Path, opened: Opened
+):
+    path = tmp_path / "other.pcap"
+    path.write_bytes(capture_of([(1_764_000_000, k, udp(payload, port)) for k in range(50)]))
+    with pytest.raises(SourceError, match=name) as caught:
+        opened(path)
+    assert driver in str(caught.value.remedy)
+
+
+def test_packets_of_another_maker_beside_those_of_the_lidar_are_counted(
+    real: Path, tmp_path: Path, opened: Opened
+):
+    packets = frames(real.read_bytes())
+    other = [(s, f, udp(bytes(1400), 7502)) for s, f, _ in packets[:20]]
+    path = tmp_path / "both.pcap"
+    path.write_bytes(capture_of([*other, *packets]))
+    source = opened(path)
+    assert source.description.sensor.name == "VLP-16"
+    assert source.losses == {"packets of Ouster": 20}

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from pipeline.io.readers.point_times import PointTimes
 from pipeline.io.readers.ros_records import LayoutError, decode_cloud
 
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -88,13 +89,15 @@ def test_any_layout_gives_back_what_was_put_in(
     table["t"] = rng.integers(0, 100_000_000, len(table))
     gone = rng.random(len(table)) < 0.3
     table["y"][gone] = np.nan
-    scan = decode_cloud(encode(table, height=height, padding=padding), STAMP_NS)
+    times = PointTimes("t", 1, "stamp", 10**8)
+    scan = decode_cloud(encode(table, height=height, padding=padding), STAMP_NS, times)
     kept = table[~gone]
     assert scan.dropped == np.count_nonzero(gone)
     np.testing.assert_array_equal(scan.points, np.stack([kept[a].astype(np.float32) for a in "xyz"], axis=1))
     np.testing.assert_array_equal(scan.reflectance, kept["intensity"].astype(np.float32))
     np.testing.assert_array_equal(scan.ring, kept["ring"])
-    np.testing.assert_array_equal(scan.offset_ns, kept["t"])
+    if len(kept):
+        np.testing.assert_array_equal(scan.offset_ns, kept["t"])
 
 
 XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
@@ -125,31 +128,6 @@ def test_headers_that_contradict_the_data_are_refused(changes: dict[str, object]
         setattr(message, name, value)
     with pytest.raises(LayoutError):
         decode_cloud(message, 0)
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e3, 1e6, 1e9])
-def test_times_since_1970_are_made_relative(unit: float):
-    table = np.ones(3, np.dtype([*XYZ.descr, ("timestamp", "<f8")]))
-    table["timestamp"] = (STAMP_NS / 1e9 + np.array([0.0, 0.05, 0.1])) * unit
-    offset_ns = decode_cloud(encode(table), STAMP_NS).offset_ns
-    assert offset_ns is not None
-    np.testing.assert_allclose(offset_ns, [0, 50_000_000, 100_000_000], atol=500)
-
-
-def test_a_point_without_a_time_has_that_of_the_stamp():
-    table = np.ones(3, np.dtype([*XYZ.descr, ("timestamp", "<f8")]))
-    table["timestamp"] = [STAMP_NS / 1e9 - 0.05, np.nan, STAMP_NS / 1e9 + 0.05]
-    offset_ns = decode_cloud(encode(table), STAMP_NS).offset_ns
-    assert offset_ns is not None
-    np.testing.assert_allclose(offset_ns, [-50_000_000, 0, 50_000_000], atol=500)
-
-
-def test_times_far_from_the_stamp_are_not_used():
-    table = np.ones(3, np.dtype([*XYZ.descr, ("timestamp", "<f8")]))
-    table["timestamp"] = [1e300, np.nan, -np.inf]
-    assert decode_cloud(encode(table), STAMP_NS).offset_ns is None
-    table["timestamp"] = [5.0, 6.0, 7.0]
-    assert decode_cloud(encode(table), STAMP_NS).offset_ns is None
 
 
 def test_a_reflectance_that_is_not_finite_is_replaced_in_the_scan_alone():

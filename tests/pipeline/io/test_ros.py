@@ -12,10 +12,21 @@ import pytest
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import SourceOptions
+from pipeline.io.readers.container import Channel
+from pipeline.io.readers.topics import choose_topics
 from pipeline.types.records import Imu, Odometry, Scan
 from tests.benchmarks.mutating import read_all
 from tests.pipeline.io.conftest import Opened
-from tests.pipeline.io.recordings import SCANS, START_NS, STEP_NS, drive, points_of, write_recording
+from tests.pipeline.io.recordings import (
+    SCANS,
+    START_NS,
+    STEP_NS,
+    Author,
+    Write,
+    drive,
+    points_of,
+    write_recording,
+)
 from tests.pipeline.io.test_bad_input import mutations
 
 KINDS = ["bag", "db3", "mcap"]
@@ -104,6 +115,25 @@ def test_a_missing_topic_is_told_with_the_topics_that_are_there(opened: Opened, 
         opened(path)
 
 
+@pytest.mark.parametrize(
+    ("topic", "msgtype", "helps"),
+    [
+        ("/scan_multi", "sensor_msgs/msg/MultiEchoLaserScan", "which is not read: play it through"),
+        ("/odom", "nav_msgs/msg/Odometry", "No topic of it is of a LiDAR"),
+    ],
+)
+def test_without_scans_the_remedy_is_one_that_helps(topic: str, msgtype: str, helps: str):
+    with pytest.raises(SourceError, match="no scans") as raised:
+        choose_topics([Channel(1, topic, msgtype, "cdr", 5)], {}, "run")
+    assert helps in raised.value.remedy
+
+
+def test_a_topic_of_scans_without_messages_is_named():
+    with pytest.raises(SourceError, match="no scans") as raised:
+        choose_topics([Channel(1, "/points", "sensor_msgs/msg/PointCloud2", "cdr", 0)], {}, "run")
+    assert "/points has no message" in raised.value.remedy
+
+
 def test_a_part_that_is_only_there_compressed_is_told(opened: Opened, tmp_path: Path):
     folder = write_recording("db3", tmp_path, drive)
     (part,) = folder.glob("*.db3")
@@ -172,6 +202,25 @@ def test_a_topic_of_bad_scans_only_is_refused(opened: Opened, tmp_path: Path):
     path = write_recording("bag", tmp_path, spoiled)
     with pytest.raises(SourceError, match=r"cannot be read.*topic /points"):
         opened(path)
+
+
+def begin_with_nothing(author: Author, write: Write) -> None:
+    """60 clouds without points, of which every third cannot be read, before the drive."""
+    for k in range(60):
+        stamp_ns = START_NS - (60 - k) * STEP_NS
+        cloud = author.cloud(stamp_ns, points_of(0)[:0])
+        if k % 3 == 0:
+            cloud.width = 1000
+        write("/velodyne_points", "sensor_msgs/msg/PointCloud2", stamp_ns, cloud)
+    drive(author, write)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_empty_clouds_at_the_start_are_counted(kind: str, opened: Opened, tmp_path: Path):
+    source = opened(write_recording(kind, tmp_path, begin_with_nothing))
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    assert [scan.stamp_ns for scan in scans] == [START_NS + k * STEP_NS for k in range(SCANS)]
+    assert source.losses == {"scans without points": 40, "scans that cannot be read": 20}
 
 
 @pytest.mark.parametrize("kind", ["bag", "mcap"])

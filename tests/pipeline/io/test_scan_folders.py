@@ -13,6 +13,7 @@ import pytest
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers import open_source
 from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.io.readers.pose_files import TextError, read_any_poses
 from pipeline.types.records import Odometry, Scan
@@ -186,3 +187,48 @@ def test_a_folder_of_broken_links_is_refused(tmp_path: Path, opened: Opened):
     (tmp_path / "velodyne" / "000000.bin").symlink_to(tmp_path / "missing.bin")
     with pytest.raises(SourceError, match=r"the folder has no \.bin files"):
         opened(tmp_path)
+
+
+def drive_of_pcds(folder: Path, *, in_world: bool, views: bool) -> list[Pose3]:
+    """Scans of a stand along a curve, as pcl_ros or a mapping program writes them; return the poses."""
+    run = open_source("sim:stand?duration=6")
+    scans = [record for record in run.records() if isinstance(record, Scan)][::6]
+    poses = []
+    for k, scan in enumerate(scans):
+        pose = Pose3.from_euler((5.0 + 1.5 * k, -3.0 + 0.2 * k, 1.2), 0.0, 0.02, 0.1 * k)
+        points = pose.apply(scan.points.astype(np.float64)) if in_world else scan.points
+        table = np.zeros(len(points), [(name, "<f4") for name in ("x", "y", "z")])
+        for axis, column in zip("xyz", points.T, strict=True):
+            table[axis] = column
+        place = " ".join(f"{value:.9g}" for value in (*pose.t, *pose.quaternion()))
+        head = (
+            "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
+            f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {place if views else '0 0 0 1 0 0 0'}\n"
+            f"POINTS {len(points)}\nDATA binary\n"
+        )
+        (folder / f"{k:06d}.pcd").write_bytes(head.encode() + table.tobytes())
+        poses.append(pose)
+    np.save(folder / "first.points", scans[3].points)
+    return poses
+
+
+@pytest.mark.parametrize("in_world", [False, True])
+@pytest.mark.parametrize("views", [False, True])
+def test_the_poses_in_the_headers_move_the_scans(in_world: bool, views: bool, tmp_path: Path, opened: Opened):
+    """The poses are in the headers, or in a file; the points are those of the sensor, or of the world."""
+    poses = drive_of_pcds(tmp_path, in_world=in_world, views=views)
+    if not views:
+        rows = [f"{k} {' '.join(map(str, pose.t))} {' '.join(map(str, np.roll(pose.quaternion(), -1)))}"
+                for k, pose in enumerate(poses)]  # fmt: skip
+        (tmp_path / "poses.txt").write_text("\n".join(rows))
+    source = opened(tmp_path)
+    assert source.description.has_odometry
+    assert any("VIEWPOINT" in text for text in source.description.warnings) == views
+    assert any("moved back" in text for text in source.description.warnings) == in_world
+    records = list(source.records())
+    odometry = [record for record in records if isinstance(record, Odometry)]
+    scans = [record for record in records if isinstance(record, Scan)]
+    for found, pose in zip(odometry, poses, strict=True):
+        np.testing.assert_allclose(found.T_odom_base.t, pose.t, atol=1e-6)
+        np.testing.assert_allclose(found.T_odom_base.R, pose.R, atol=1e-6)
+    np.testing.assert_allclose(scans[3].points, np.load(tmp_path / "first.points.npy"), atol=1e-4)

@@ -15,6 +15,7 @@ from pipeline.loop_closure.stem_matching import (
     aligned,
     alignment_covariance,
     find_constellation,
+    find_displacement,
     pairs_within,
     worst_sigma,
 )
@@ -222,3 +223,25 @@ def test_the_worst_sigma_is_the_larger_eigenvalue(seed):
     C = A @ A.transpose(0, 2, 1)
     wanted = np.sqrt(np.linalg.eigvalsh(C)[:, 1])
     np.testing.assert_allclose(worst_sigma(C[:, [0, 0, 1], [0, 1, 1]]), wanted, rtol=1e-9)
+
+
+@given(x=st.floats(-0.8, 0.8), y=st.floats(-0.8, 0.8), yaw=st.floats(-0.02, 0.02), seed=st.integers(0, 50))
+def test_a_small_displacement_is_found_by_few_stems(x: float, y: float, yaw: float, seed: int):
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(np.arange(0.0, 21.0, 7.0), np.arange(0.0, 14.0, 7.0)), axis=-1).reshape(-1, 2)
+    reference = grid + rng.uniform(-1.0, 1.0, grid.shape)
+    drift = Pose2(x, y, yaw)
+    local = drift.inverse().apply(reference[:5]) + rng.normal(0.0, 0.02, (5, 2))
+    match = find_displacement(MapStems.at(local), MapStems.at(reference), Relocalisation(), 1.5)
+    assert match.pose is not None
+    assert np.hypot(*(match.pose.apply(local) - reference[:5]).T).max() < 0.15
+    assert match.reference.tolist() == match.local.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_stems_elsewhere_are_no_displacement():
+    rng = np.random.default_rng(4)
+    local, reference = rng.uniform(0.0, 20.0, (8, 2)), rng.uniform(0.0, 20.0, (8, 2))
+    match = find_displacement(MapStems.at(local), MapStems.at(reference), Relocalisation(), 1.0)
+    assert match.pose is None
+    few = find_displacement(MapStems.at(reference[:3]), MapStems.at(reference), Relocalisation(), 1.0)
+    assert few.reason == "too few stems"

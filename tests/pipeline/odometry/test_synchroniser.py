@@ -252,6 +252,24 @@ def test_views_are_no_more_frequent_than_the_scans_of_a_usual_sensor(hz, wanted)
     assert sum(step.is_view for step in joined) == 10 * wanted
 
 
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_each_part_of_a_turn_that_is_written_by_itself_is_viewed_and_due_as_often_as_a_whole_turn(parts):
+    rng = np.random.default_rng(0)
+    whole = rng.uniform(-np.pi, np.pi, 6000)
+    scans = []
+    for k in range(100 * parts):  # 10 turns a second
+        low = -np.pi + 2.0 * np.pi * (k % parts) / parts
+        turn = whole[(whole >= low) & (whole < low + 2.0 * np.pi / parts)]
+        points = 8.0 * np.stack([np.cos(turn), np.sin(turn), 0.1 * turn], axis=1)
+        scans.append(scan(START + round(k * 100 * MS / parts), points))
+    joined = list(steps(scans, odometry="static"))
+    for part in range(parts):
+        own = joined[part::parts]
+        assert all(step.is_view for step in own)
+        late = [step for step in own if step.elapsed_ns >= 1_000_000_000]
+        assert sum(step.is_due(0.4) for step in late) in (22, 23)
+
+
 def test_a_jitter_of_the_stamps_loses_no_view():
     jitter = np.random.default_rng(0).uniform(-9.0, 9.0, 50)
     joined = steps([at(100.0 * k + jitter[k]) for k in range(50)], odometry="static")

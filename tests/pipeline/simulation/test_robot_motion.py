@@ -266,8 +266,12 @@ def test_a_way_without_sharp_turns_has_no_turns_on_the_spot():
     assert (drive.speed[drive.t > 2.0] > 0.2).all()
 
 
+# In steps, because the square of a speed that is limited by a difference of 1e-300 overflows.
+CURVATURE = st.floats(-8.0, 8.0).map(lambda k: round(k, 6))
+
+
 @given(
-    st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(-8.0, 8.0)), min_size=2, max_size=40),
+    st.lists(st.tuples(st.floats(0.0, 2.0), CURVATURE), min_size=2, max_size=40),
     st.floats(0.01, 0.5),
 )
 def test_speeds_are_the_fastest_between_which_a_robot_can_change(samples, ds):

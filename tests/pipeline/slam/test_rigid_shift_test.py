@@ -14,6 +14,7 @@ from pipeline.slam.motion import Noise, OdometryTrust
 from pipeline.slam.rigid_shift_test import AGREE, FEWEST, MANY, SEVERAL, estimate_rigid_shift
 from pipeline.slam.slip_detection import (
     FITTED,
+    MISREGISTERED,
     OWN,
     SLIPPED,
     STUCK,
@@ -219,6 +220,7 @@ def test_the_motion_of_stuck_wheels_is_recovered_at_any_distance(true, before):
     assert slip_message(np.zeros(3), result.slipped, False) == STUCK
     assert slip_message(np.array([0.1, 0.0, 0.0]), result.slipped, False) == SLIPPED
     assert slip_message(np.zeros(3), False, False) == ""
+    assert slip_message(np.zeros(3), result.slipped, False, registered=True) == MISREGISTERED
 
 
 @pytest.mark.parametrize("bearing", [0.0, np.pi / 2, np.pi, -np.pi / 2])

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import preset
+from pipeline.detection.cylinder_fit import BEAM
 from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
 from pipeline.tracking.kalman import ENGINES, H, process_noise, transition
@@ -301,7 +302,7 @@ def test_a_diameter_needs_three_radii_and_weighs_them():
     tracks, p = t.tracks, t.parameters
     weight, dbh = tracks.radius_weight[0], trees.dbh[0]
     reach, above = tracks.radius_reach[0] / weight, tracks.radius_above[0] / weight
-    views = 1.0 / (weight * reach**2) + (EDGE * reach + UNEVEN) ** 2
+    views = 1.0 / (weight * reach**2) + (EDGE * BEAM * reach + UNEVEN) ** 2
     stem = (p.out_of_round * dbh) ** 2 + (p.taper_sigma * above) ** 2
     assert trees.dbh_sigma[0] == pytest.approx(np.sqrt(4.0 * views + stem))
     assert 0.02 < trees.dbh_sigma[0] < 0.1

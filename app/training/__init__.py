@@ -1,1 +1,0 @@
-"""Training of the random forest that classifies columns, from simulated, labelled and annotated scenes."""

@@ -1,0 +1,122 @@
+"""The core and the extensions are apart: only an extension knows its words, and each can be missing."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+
+from app.cli import WRONG_USAGE, main
+from app.common.settings import Settings
+from app.dashboard.parameters import ParameterState
+from app.extension import VARIABLE, all_extensions
+from app.web.app import build
+from app.web.auth import AccessTokens
+from app.worker.protocol import Open
+from app.worker.supervisor import WorkerProcess
+from tests.app.fake_scene import FakeScene
+from tests.app.server_for_tests import BEARER, HOST, PORT, TOKEN
+
+ROOT = Path(__file__).resolve().parents[3]
+#: Words by which only the files of an extension name what it does.
+WORDS = {
+    "dds": r"\bdds:|DdsLink|cyclone|plain DDS|fast_?dds",
+    "fleet": r"fleet|robots-link|common.map",
+    "formats": r"victoria",
+    "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
+    "learning": r"learning|\blearn-|stemmap train\b|\"train\"|Learn:",
+}
+NAMES = sorted(WORDS)
+FOLDERS = ("app", "pipeline", "static", "tests/app", "tests/pipeline", "tests/browser")
+SUFFIXES = {".py", ".js", ".html", ".css", ".j2", ".toml"}
+
+
+def test_each_extension_of_the_package_has_its_words():
+    ours = [each.name for each in all_extensions() if each.package.startswith("stemmap ")]
+    assert ours == NAMES
+    assert not [each.problem for each in all_extensions() if each.problem]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_only_its_own_files_name_an_extension(name):
+    word = re.compile(WORDS[name], re.IGNORECASE)
+    offenders = []
+    for path in (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*"))):
+        place = path.relative_to(ROOT).as_posix()
+        is_own = f"extensions/{name}/" in place or f"extensions/survey_{name}" in place
+        is_own |= place.startswith(f"tests/browser/extensions/test_{name}") or path == Path(__file__)
+        if path.suffix not in SUFFIXES or is_own or "vendor" in path.parts:
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            if word.search(line):
+                offenders.append(f"{place}:{number} {line.strip()[:80]}")
+    assert offenders == []
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [("tune sim:stand", "search"), ("train", "learning"), ("evaluate sim:stand --param-grid x=1", "search")],
+)
+def test_what_is_switched_off_is_named(words: str, name: str, monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setenv(VARIABLE, "")
+    assert main(words.split()) == WRONG_USAGE
+    assert f"The extension {name} is switched off by {VARIABLE}." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("off", ["all", *NAMES])
+async def test_the_core_needs_no_extension(off: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """A run is opened, played, tuned, annotated and exported, with a real worker process."""
+    monkeypatch.setenv(VARIABLE, "" if off == "all" else ",".join(name for name in NAMES if name != off))
+    app = build(
+        Settings(folder=tmp_path),
+        port=PORT,
+        tokens=AccessTokens(TOKEN),
+        source=Open("sim:paper?duration=2"),
+        parameter_state=ParameterState(),
+        make_scene=lambda _dashboard, _loop: FakeScene(),
+        make_worker=WorkerProcess,
+    )
+    async with (
+        asyncio.timeout(120),
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(
+            transport=httpx.ASGITransport(app), base_url=f"http://{HOST}", headers=BEARER, timeout=60
+        ) as client,
+    ):
+
+        async def finished() -> dict[str, object]:
+            while (status := (await client.get("/api/status")).json())["state"] != "finished":
+                assert status["state"] != "failed", status["detail"]
+                await asyncio.sleep(0.05)
+            return dict(status)
+
+        modules = (await client.get("/api/extensions")).json()["modules"]
+        assert not [each for each in modules if off in ("all", each.split("/")[4])]
+        for page in ("/", "/static/js/shell/main.js", *modules):
+            assert (await client.get(page)).status_code == 200
+        await client.post("/api/command", json={"type": "set_speed", "factor": 0})
+        before = await finished()
+        assert before["trees"]
+        answer = await client.patch("/api/parameters", json={"changes": {"clustering.eps": 0.3}})
+        assert answer.json()["changed"] == ["clustering.eps"]
+        await finished()
+        tree = (await client.get("/api/trees")).json()["trees"][0]
+        added = await client.post(
+            "/api/annotations",
+            json={
+                "run": (await client.get("/api/annotations")).json()["run"],
+                "x": tree["x"],
+                "y": tree["y"],
+                "kind": "tree",
+                "who": "me",
+                "browser": 16 * "a",
+            },
+        )
+        assert added.status_code == 201, added.text
+        assert "tree" in (await client.get("/api/annotations.csv")).text
+        for file in ("/api/trees.csv", "/api/export/geojson", "/api/export/gpkg"):
+            exported = await client.get(file)
+            assert (exported.status_code, len(exported.content) > 100) == (200, True), exported.text

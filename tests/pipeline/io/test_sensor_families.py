@@ -1,0 +1,85 @@
+"""The family of a topic by its fields, its message type and its names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.io.readers.point_times import time_fields
+from pipeline.io.readers.sensor_families import (
+    DEPTH_CAMERA,
+    FAMILIES,
+    HESAI,
+    LIVOX,
+    OUSTER,
+    OUSTER_PACKETS,
+    ROBOSENSE,
+    VELODYNE,
+    SensorFamily,
+    family_of,
+    family_of_messages,
+    family_of_packets,
+    markdown_tables,
+)
+from pipeline.io.readers.topics import TYPES_BY_ROLE
+from pipeline.simulation.scenarios import LIDAR_NAMES
+
+XYZ = ("x", "y", "z", "intensity")
+
+
+@pytest.mark.parametrize("family", [f for f in FAMILIES if f.fields], ids=lambda family: family.name)
+def test_the_fields_of_a_driver_are_of_its_family(family: SensorFamily):
+    organised = family in (ROBOSENSE, OUSTER, DEPTH_CAMERA)
+    assert family_of(family.fields, "sensor_msgs/msg/PointCloud2", organised=organised) is family
+
+
+@pytest.mark.parametrize(
+    ("fields", "names", "organised", "family"),
+    [
+        ((*XYZ, "ring", "timestamp"), ("/rslidar_points", "rslidar"), False, ROBOSENSE),
+        ((*XYZ, "timestamp", "ring"), ("/hesai/pandar", "hesai_lidar"), True, HESAI),
+        ((*XYZ, "ring", "timestamp"), ("/points", "lidar"), False, HESAI),
+        ((*XYZ, "ring", "timestamp"), ("/points", "lidar"), True, ROBOSENSE),
+        ((*XYZ, "t", "ring"), ("/points", "base_link"), False, OUSTER),
+        ((*XYZ, "ring", "time"), ("/points_raw", ""), False, VELODYNE),
+        ((*XYZ, "tag", "line"), ("/points",), False, LIVOX),
+        (XYZ, ("/livox/lidar", "livox_frame"), False, LIVOX),
+        (XYZ, ("/points", "lidar"), False, None),
+        (XYZ, ("/points", "lidar"), True, DEPTH_CAMERA),
+        (("x", "y", "z", "rgb"), ("/camera/depth/color/points",), False, DEPTH_CAMERA),
+        (("range", "bearing"), ("/points",), False, None),
+    ],
+)
+def test_the_family_of_a_cloud(
+    fields: tuple[str, ...], names: tuple[str, ...], organised: bool, family: SensorFamily | None
+):
+    assert family_of(fields, "sensor_msgs/msg/PointCloud2", names=names, organised=organised) is family
+
+
+def test_a_message_type_is_of_one_family_and_is_read_if_the_table_says_so():
+    for family in FAMILIES:
+        for msgtype in (*family.messages, *family.packets):
+            assert family_of_messages(msgtype) is family
+            assert family_of((), msgtype) is family
+            # Packets of Ouster become clouds before their topic is chosen.
+            is_scan = msgtype in family.messages and msgtype not in OUSTER_PACKETS
+            assert (msgtype in TYPES_BY_ROLE["scan"]) is is_scan
+            assert family_of_packets(msgtype) is (family if msgtype in family.packets else None)
+    assert family_of_messages("sensor_msgs/msg/PointCloud2") is None
+
+
+def test_the_point_times_of_all_drivers_are_read():
+    for family in FAMILIES:
+        if family.fields and family is not DEPTH_CAMERA:
+            assert time_fields(family.fields)
+
+
+def test_each_simulated_sensor_is_of_one_family():
+    names = [name for family in FAMILIES for name in family.simulated]
+    assert sorted(names) == sorted(LIDAR_NAMES)
+
+
+def test_the_tables_in_the_docs_are_those_of_the_code():
+    text = (Path(__file__).parents[3] / "docs" / "sensors.md").read_text()
+    assert markdown_tables() in text
