@@ -66,29 +66,35 @@ def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Conte
     return found
 
 
-def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content]:
-    """Return the annotations of a recording that review trees, in the frame of the map.
+def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content] | None:
+    """Return the annotations of a recording that review trees, in the frame of the map; None if it never had
+    an annotation in this store, so that the reviews in the files of a run are those of another machine.
 
     Args:
         store: The store.
         source: Member `source` of run.json.
     """
-    return [content for content in store.contents(_key(source)) if content.kind in (*KINDS, SKIPPED)]
+    if not store.was_annotated(key := _key(source)):
+        return None
+    return [content for content in store.contents(key) if content.kind in (*KINDS, SKIPPED)]
 
 
 @contextmanager
-def reviewed_run(folder: FilePath, contents: Sequence[Content]) -> Iterator[FilePath]:
+def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterator[FilePath]:
     """Yield a folder with the run of `folder` in which trees.csv has the reviews by annotations of its
     recording, and no others; the folder itself if there are neither annotations nor reviews. A temporary
     folder is removed afterwards; errors name `folder` instead.
 
     Args:
         folder: Folder that `stemmap map` wrote.
-        contents: Annotations in the frame of the map.
+        contents: Annotations in the frame of the map; None yields `folder` unchecked.
 
     Raises:
         StemmapError: A file of the run is missing or damaged.
     """
+    if contents is None:
+        yield folder
+        return
     run = read_run(folder)  # checks the files
     if not (contents or run.rejected or {*run.reviews.values()} - {OPEN}):
         yield folder

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -202,7 +202,7 @@ def reviewed(run: Path) -> Iterator[Path]:
     from app.common.text import count
 
     contents = stored_on_page(run, stored_reviews) if run.is_dir() else None
-    with nullcontext(run) if contents is None else reviewed_run(run, contents) as folder:
+    with reviewed_run(run, contents) as folder:
         if folder != run and (rejected := read_run(folder).rejected):
             print(f"review: {count(rejected, 'tree')} rejected on the page left out", file=sys.stderr)
         yield folder

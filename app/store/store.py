@@ -453,6 +453,18 @@ class Store:
         with self._engine.begin() as connection:
             return [_content(row) for row in connection.execute(query.order_by(_annotations.c.id))]
 
+    def was_annotated(self, source: str) -> bool:
+        """Return whether a source ever had an annotation, also one that is deleted now.
+
+        Args:
+            source: Digest of the recording, or its URI if it has no digest.
+        """
+        query = select(_annotations.c.id).join(_runs, _runs.c.id == _annotations.c.run)
+        with self._engine.begin() as connection:
+            return (
+                connection.execute(query.where(_runs.c.source == _key(source)).limit(1)).first() is not None
+            )
+
     def annotation_counts(self) -> dict[int, int]:
         """Return a dict from the number of each source with annotations of KINDS to their number."""
         a = _annotations.c

@@ -5,18 +5,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
+import html
 import mimetypes
 from collections.abc import AsyncIterator
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import Annotated
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import msgspec
 from fastapi import APIRouter, Request
 from msgspec import Meta
-from starlette.responses import FileResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, RedirectResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from app.common.user import current_user
@@ -35,6 +37,9 @@ router = APIRouter()
 mimetypes.add_type("text/javascript", ".js")
 mimetypes.add_type("text/javascript", ".mjs")
 
+# Where index.html names the extensions.
+_EXTENSIONS = "<!-- extensions -->"
+
 _CHECK_EACH_TIME = {"Cache-Control": "no-cache"}
 
 # Plotly writes style attributes and takes pictures through blob: and data: addresses.
@@ -52,8 +57,34 @@ _VISER_POLICY = (
 
 @router.get("/")
 def page(request: Request) -> Response:
-    """GET /: return the dashboard, or 304 if the browser has it."""
-    return _file(request, static_folder() / "index.html", _PAGE_POLICY)
+    """GET /: return the dashboard with the modules of its extensions, or 304 if the browser has it."""
+    content = dashboard_page()
+    headers = {
+        **_CHECK_EACH_TIME,
+        "Content-Security-Policy": _PAGE_POLICY,
+        "ETag": f'"{hashlib.sha256(content.encode()).hexdigest()[:32]}"',
+    }
+    if headers["ETag"] in _known_tags(request):
+        return Response(status_code=304, headers=headers)
+    return HTMLResponse(content, headers=headers)
+
+
+def dashboard_page() -> str:
+    """Return index.html with the style sheets and the JavaScript modules of the extensions that are switched
+    on in front of those of the dashboard, which starts what they register."""
+    pages = {name: each.page for name, each in extensions_on().items() if each.page is not None}
+    folders = {name: f"/static/{EXTENSION_PAGES}/{quote(name)}" for name in pages}
+    styles = [
+        f'<link rel="stylesheet" href="{folders[name]}/main.css">'
+        for name, page in pages.items()
+        if (page / "main.css").is_file()
+    ]
+    modules = [
+        f'<script type="module" data-extension="{html.escape(name)}" src="{folder}/main.js"></script>'
+        for name, folder in folders.items()
+    ]
+    text = (static_folder() / "index.html").read_text(encoding="utf-8")
+    return text.replace(_EXTENSIONS, "\n  ".join([*styles, *modules]))
 
 
 @router.get(HEALTH)
@@ -67,20 +98,6 @@ async def health(dashboard: Dash) -> Response:
 def runs_page(request: Request) -> Response:
     """GET /runs: return the page of all runs, or 304 if the browser has it."""
     return _file(request, static_folder() / "runs.html", _PAGE_POLICY)
-
-
-@router.get("/api/extensions")
-def page_modules() -> Response:
-    """GET /api/extensions: return an object with `modules` and `styles`, lists of the addresses of the
-    JavaScript modules and the style sheets of the extensions that are switched on."""
-    pages = {name: each.page for name, each in extensions_on().items() if each.page is not None}
-    styled = [name for name, page in pages.items() if (page / "main.css").is_file()]
-    return json_reply(
-        {
-            "modules": [f"/static/{EXTENSION_PAGES}/{name}/main.js" for name in pages],
-            "styles": [f"/static/{EXTENSION_PAGES}/{name}/main.css" for name in styled],
-        }
-    )
 
 
 @router.get("/api/access")
@@ -161,10 +178,14 @@ def _file(request: Request, path: Path, policy: str) -> Response:
     """
     headers = {**_CHECK_EACH_TIME, "Content-Security-Policy": policy}
     answer = FileResponse(path, headers=headers, stat_result=path.stat())
-    known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
-    if answer.headers["etag"] in known:
+    if answer.headers["etag"] in _known_tags(request):
         return Response(status_code=304, headers={**headers, "ETag": answer.headers["etag"]})
     return answer
+
+
+def _known_tags(request: Request) -> list[str]:
+    """Return the ETags of the versions that the browser has."""
+    return [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]
 
 
 def _page_path(path: str) -> Path | None:

@@ -31,7 +31,7 @@ import { startTable } from "../trees/table.js";
 import { startCompare } from "../tune/compare.js";
 import { startTunePanel } from "../tune/panel.js";
 import { startTuning } from "../tune/parameters.js";
-import { loadExtensions, startExtensions } from "./extensions.js";
+import { startExtensions } from "./extensions.js";
 import { startKeys } from "./keys.js";
 import { startLayout } from "./layout.js";
 import { startPalette } from "./palette.js";
@@ -40,10 +40,7 @@ import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
-// The page has its colours and layout while the extensions load.
-for (const start of [startTheme, startLayout]) start();
-await loadExtensions();
-for (const start of [startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startPlotsPanel, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
+for (const start of [startTheme, startLayout, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startPlotsPanel, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
   startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startWelcome, startShare, startExtensions]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

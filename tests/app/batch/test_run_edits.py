@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -100,3 +101,23 @@ def test_commands_use_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
     assert len(features) == 99
     stemmap(capsys, "report", folder, "--out", tmp_path / "report.html")
     assert "1 rejected in the review" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("was_reviewed_here", [False, True])
+def test_reviews_in_the_files_count_until_the_recording_is_annotated_here(
+    tmp_path, capsys, monkeypatch, was_reviewed_here
+):
+    monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path / "kept"))
+    folder = grid_run(tmp_path / "run")
+    file = folder / "trees.csv"
+    file.write_text(file.read_text().replace(",open", ",rejected", 1))
+    run = read_run(folder)
+    with closing(Store(tmp_path / "kept")) as store:
+        number = store.open_run(run.record["source"]["sha256"], run.uri, "grid")
+        if was_reviewed_here:
+            author = Author("a" * 16, "Ann")
+            store.add(number, author, [Content(1.0, 1.0, "pole")])
+            store.undo(number, author)
+    stemmap(capsys, "stand", folder, "--out", tmp_path / "out")
+    left_out = json.loads((tmp_path / "out" / "stand.json").read_text())["trees_left_out"]
+    assert left_out["rejected"] == (0 if was_reviewed_here else 1)

@@ -50,7 +50,6 @@ ROUTES = [
     ("GET", "/"),
     ("GET", "/runs"),
     ("GET", "/api/access"),
-    ("GET", "/api/extensions"),
     ("DELETE", "/api/access/viewer-link"),
     ("GET", "/static/plotly.min.js"),
     ("GET", "/static/index.html"),

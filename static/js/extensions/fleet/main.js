@@ -2,12 +2,15 @@
 
 import { get } from "../../core/api.js";
 import { byId, el } from "../../core/dom.js";
+import { extend } from "../../shell/extensions.js";
 
 const TITLE = "All robots: one card each, and one common map";
 
-export async function start() {
+async function start() {
   const { page } = await get("/api/fleet");
   if (page) document.querySelector(".strip-end").prepend(el("a", { id: "robots-link", class: "quiet small", href: page, text: "All robots", title: TITLE }));
 }
 
-export const presentActions = () => (byId("robots-link") ? [[TITLE, "", () => byId("robots-link").click()]] : []);
+const presentActions = () => (byId("robots-link") ? [[TITLE, "", () => byId("robots-link").click()]] : []);
+
+extend(import.meta.url, { start, presentActions });

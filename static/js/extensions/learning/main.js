@@ -10,6 +10,7 @@ import { on, state } from "../../core/store.js";
 import { throttled } from "../../core/timing.js";
 import { counted } from "../../core/verdicts.js";
 import { exists, pressIn } from "../../shell/dynamic_actions.js";
+import { extend } from "../../shell/extensions.js";
 import { visible } from "../../shell/tabs.js";
 
 // As in the tab Scores, but on the annotated objects instead of a map.
@@ -42,7 +43,7 @@ const forget = () => doing(() => remove("/api/learning"));
 const use = () => doing(() => post("/api/learning/use", {}));
 const backToPackage = () => doing(() => post("/api/parameters/reset", { names: ["classification.forest"] }));
 
-export function annotateSections() {
+function annotateSections() {
   return [el("section", { class: "learn", "aria-label": "Learn" },
     el("h2", { text: "Learn" }), el("p", { id: "learn-known", class: "note dim" }), el("div", { id: "learn-now", role: "status" }),
     el("p", { id: "learn-error", class: "error", role: "alert", hidden: true }))];
@@ -140,14 +141,16 @@ const BUTTONS = [
   ["Learn: stop the training", "learn-stop"], ["Learn: use the built-in decision trees", "learn-package"],
 ];
 
-export const presentActions = () => [
+const presentActions = () => [
   ...BUTTONS.filter(([, id]) => exists(id)).map(([title, id]) => [title, "", edits(pressIn("annotate", id))]),
   ["Learn: train decision trees from the annotations", "", edits(pressIn("annotate", "learn-grow"))],
 ];
 
-export function start() {
+function start() {
   receive("learning", (message) => { now = message; });
   on("tab annotations", update);
   on("learning parameters tab", fill);
   on("parameters", () => inForce() !== PACKAGE && known?.in_use?.name !== inForce() && update());
 }
+
+extend(import.meta.url, { start, presentActions, annotateSections });

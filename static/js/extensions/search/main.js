@@ -3,6 +3,7 @@
 import { el } from "../../core/dom.js";
 import { edits } from "../../core/permissions.js";
 import { exists, pressIn } from "../../shell/dynamic_actions.js";
+import { extend } from "../../shell/extensions.js";
 import { openParameter } from "../../tune/panel.js";
 import { tuning } from "../../tune/parameters.js";
 import { searchPart, startSearch } from "./search.js";
@@ -14,17 +15,19 @@ const BUTTONS = [
   ["Stop the search for parameters", "search-stop"], ["Use the parameters that were found", "search-use"], ["Save the parameters that were found as a set", "search-save"],
 ];
 
-export const tuneParts = () => [el("details", { class: "tune-part" }, el("summary", { text: "Search for better values" }), searchPart)];
+const tuneParts = () => [el("details", { class: "tune-part" }, el("summary", { text: "Search for better values" }), searchPart)];
 
-export const parameterButtons = (spec) => (spec.kind === "name" ? [] : [sensitivityButton(spec)]);
+const parameterButtons = (spec) => (spec.kind === "name" ? [] : [sensitivityButton(spec)]);
 
-export const presentActions = () => [
+const presentActions = () => [
   ...BUTTONS.filter(([, id]) => exists(id)).map(([title, id]) => [title, "", edits(pressIn("tune", id))]),
   ...tuning.specs.filter(({ kind }) => kind !== "name").map((spec) =>
     [`Sensitivity of ${spec.title} (${spec.stage})`, "", edits(() => { openParameter(spec.name); requestSensitivity(spec); }), `${spec.name} how much does it matter ∿`]),
 ];
 
-export function start() {
+function start() {
   startSensitivity();
   startSearch();
 }
+
+extend(import.meta.url, { start, presentActions, tuneParts, parameterButtons });
