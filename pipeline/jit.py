@@ -1,8 +1,9 @@
 """Compilation of kernels by Numba, and the cache of their machine code.
 
 A kernel is compiled at its first call and cached next to its source, so that only the first start on a
-machine compiles. `fastmath` is off, because the same input must give the same bytes; only `compiled_sums`
-may change the order of the terms of a sum.
+machine compiles. All machines compile for one target (`fix_target`), so that the machine code can be copied
+to another machine, and the same input gives the same bytes there. `fastmath` is off for the same reason; only
+`compiled_sums` may change the order of the terms of a sum.
 
 A kernel includes functions and constants of other modules. Numba checks only the time of the file of a
 kernel; here the cache is valid for a digest of all modules of this project that the file imports.
@@ -12,7 +13,9 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import platform
 import re
+import shutil
 import sys
 import uuid
 from collections.abc import Callable, Iterator
@@ -21,11 +24,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+import llvmlite.binding
 import numba
 from numba.core import event
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+#: Name of the target of compilation in LLVM, and the features of a processor that has it (System V ABI for
+#: x86-64, level 3: Intel since 2013, AMD since 2015), by the name of the machine.
+_TARGETS = {
+    "x86_64": ("x86-64-v3", ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave")),
+    "aarch64": ("generic", ()),
+}
 
 _FROM = re.compile(r"^from ([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
 _IMPORT = re.compile(r"^import (.*)$", re.MULTILINE)
@@ -53,11 +64,24 @@ def compiled_borrowing(function: Callable[P, R]) -> Callable[P, R]:
 
 def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     """Return a kernel like `compiled` for sums over arrays, with vector registers, which is several times
-    faster. The order of the terms is fixed at compilation: runs on one kind of processor give the same bytes,
-    and two kinds may differ in the last bit, like the matrix products of NumPy."""
+    faster. The order of the terms is fixed at compilation: runs with one target give the same bytes, and two
+    targets may differ in the last bit, like the matrix products of NumPy."""
     return _kernel(function, _nrt=True, fastmath={"reassoc", "nsz"})
 
 
+def fix_target() -> None:
+    """Let Numba compile for the target of `_TARGETS` instead of the processor of this machine, whose vector
+    registers may be wider. A processor without its features keeps Numba's target, and NUMBA_CPU_NAME in the
+    environment chooses another one."""
+    name, features = _TARGETS.get(platform.machine(), ("", ()))
+    if not name or numba.config.CPU_NAME is not None:
+        return
+    present = llvmlite.binding.get_host_cpu_features()
+    if all(present.get(feature) for feature in features):
+        numba.config.CPU_NAME, numba.config.CPU_FEATURES = name, ""
+
+
+fix_target()
 _kernels: dict[Any, bool] = {}  # whether its machine code was found in the cache so far
 
 
@@ -140,9 +164,30 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
     # Entries of other sources are not read, because they may refer to classes that no longer exist.
     file._version = f"{file._version} {digest}"
     base = file._index_name.removesuffix(".nbi")
+    _copy_delivered(Path(sys.modules[module].__file__ or "").parent / "__pycache__", file, f"{base}.{digest}")
     # Two types share no file name either: an index that was read before a change leads to no other code.
     file._data_name = lambda _number: f"{base}.{digest}.{uuid.uuid4().hex[:16]}.nbc"
     file.save = _saved_by_one(file, base)
+
+
+def _copy_delivered(delivered: Path, file: Any, base: str) -> None:  # noqa: ANN401
+    """Copy the machine code of a kernel that was delivered beside its source into the cache, if the cache is
+    elsewhere, because the folder of the source is read-only or NUMBA_CACHE_DIR is set, and has none.
+
+    Args:
+        delivered: Folder of the delivered files.
+        file: Numba's object for the files of one kernel (`IndexDataCacheFile`).
+        base: Beginning of the names of the files with machine code of the present sources.
+    """
+    index = Path(file._index_path)
+    if index.parent == delivered or index.exists() or not (delivered / index.name).exists():
+        return
+    with suppress(OSError):  # else the kernel is compiled
+        index.parent.mkdir(parents=True, exist_ok=True)
+        for each in (*delivered.glob(f"{glob.escape(base)}.*.nbc"), delivered / index.name):  # the index last
+            part = index.parent / f"{each.name}.{uuid.uuid4().hex}"
+            shutil.copyfile(each, part)
+            part.replace(index.parent / each.name)
 
 
 def _saved_by_one(file: Any, base: str) -> Callable[[Any, Any], None]:  # noqa: ANN401

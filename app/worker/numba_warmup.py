@@ -2,7 +2,7 @@
 
 Two processes compile them: `python -m app.worker.numba_warmup map_scene` maps a scene and begins with the
 front end, while `... warm_tree_map` compiles SLAM and the filters of the trees, which the first one then
-finds in the cache.
+finds in the cache. `python -m app.worker.numba_warmup` runs both and waits for them.
 """
 
 from __future__ import annotations
@@ -184,4 +184,6 @@ def _stems() -> Iterator[Step]:
 
 if __name__ == "__main__":
     _programs = {"warm_up": warm_up, "map_scene": map_scene, "warm_tree_map": warm_tree_map}
-    run_child(lambda _: _programs[sys.argv[1]]())
+    if sys.argv[1:]:
+        run_child(lambda _: _programs[sys.argv[1]]())
+    warm_up()

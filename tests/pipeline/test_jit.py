@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import pytest
@@ -50,11 +52,11 @@ with on_compiling(lambda: told.append(1)):
 COMPILED, LOADED = ["0", "True", "0", "2"], ["1", "False", "2", "2"]
 
 
-def environment(folder: Path) -> dict[str, str]:
-    """Environment of a process that stores its kernels in this folder."""
+def environment(folder: Path, *, in_tree: bool = False) -> dict[str, str]:
+    """Environment of a process that stores its kernels in this folder, or beside their sources."""
     told = {
         "PYTHONPATH": f"{folder}:{ROOT}",
-        "NUMBA_CACHE_DIR": str(folder / "kept"),
+        **({} if in_tree else {"NUMBA_CACHE_DIR": str(folder / "kept")}),
         # Python itself takes a file of the same second and size for the one of before.
         "PYTHONDONTWRITEBYTECODE": "1",
     }
@@ -63,13 +65,15 @@ def environment(folder: Path) -> dict[str, str]:
     return told
 
 
-def call(folder: Path, factor: float, more: float, program: str = CALL) -> list[str]:
+def call(
+    folder: Path, factor: float, more: float, program: str = CALL, *, in_tree: bool = False
+) -> list[str]:
     """Return the words that a process prints: the result, the kernels loaded, and whether one compiled."""
     (folder / "wood" / "leaf.py").write_text(LEAF.format(factor=factor, more=more))
     told = subprocess.run(
         [sys.executable, "-c", program],
         cwd=folder,
-        env=environment(folder),
+        env=environment(folder, in_tree=in_tree),
         capture_output=True,
         text=True,
         timeout=120,
@@ -194,3 +198,72 @@ def test_a_process_loads_the_machine_code_of_the_index_that_it_read_or_none(fold
     told, of_floats = call(folder, 2.0, 1.0, KEEP.format(value="1.0"))
     assert told == "4.0"
     assert of_floats != of_whole_numbers
+
+
+def test_kernels_that_were_delivered_beside_their_sources_are_used_from_another_folder(folder):
+    assert call(folder, 2.0, 1.0, in_tree=True) == ["4.0", *COMPILED]
+    assert call(folder, 2.0, 1.0) == ["4.0", *LOADED]
+    assert call(folder, 5.0, 1.0) == ["10.0", *COMPILED]  # the delivered ones are of other sources
+
+
+TARGET = """
+import platform
+import sys
+
+import llvmlite.binding
+
+if sys.argv[1:]:
+    platform.machine = lambda: sys.argv[1]
+    features = {name: True for name in sys.argv[2:]}
+    llvmlite.binding.get_host_cpu_features = lambda: features
+import numba
+
+import pipeline.jit
+
+print(numba.config.CPU_NAME, repr(numba.config.CPU_FEATURES))
+"""
+V3 = ["avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"]
+
+
+@pytest.mark.parametrize(
+    ("machine", "chosen", "target"),
+    [
+        (["x86_64", *V3], "", "x86-64-v3 ''"),
+        (["x86_64", *V3, "avx512f"], "", "x86-64-v3 ''"),
+        (["x86_64", *V3[1:]], "", "None None"),
+        (["aarch64"], "", "generic ''"),
+        (["riscv64"], "", "None None"),
+        (["x86_64", *V3], "skylake", "skylake None"),
+    ],
+)
+def test_all_machines_of_an_architecture_compile_for_one_target(tmp_path, machine, chosen, target):
+    told = subprocess.run(
+        [sys.executable, "-c", TARGET, *machine],
+        env={**environment(tmp_path), **({"NUMBA_CPU_NAME": chosen} if chosen else {})},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert told.stdout.strip() == target
+
+
+def test_a_wheel_takes_the_kernels_along_and_an_editable_one_does_not(tmp_path, monkeypatch):
+    plugin = types.ModuleType("hatchling.builders.hooks.plugin.interface")
+    plugin.BuildHookInterface = object
+    monkeypatch.setitem(sys.modules, plugin.__name__, plugin)
+    monkeypatch.delitem(sys.modules, "pipeline.wheel_kernels", raising=False)
+    hook = importlib.import_module("pipeline.wheel_kernels").KernelsInWheel()
+    hook.root = str(tmp_path)
+    kernel = tmp_path / "pipeline" / "slam" / "__pycache__" / "a.f-1.py311.nbi"
+    kernel.parent.mkdir(parents=True)
+    kernel.touch()
+    (kernel.parent / "a.cpython-311.pyc").touch()
+    for version, files in (
+        ("standard", {str(kernel): "pipeline/slam/__pycache__/a.f-1.py311.nbi"}),
+        ("editable", {}),
+    ):
+        build = {"force_include": {}}
+        hook.initialize(version, build)
+        assert build["force_include"] == files
+    monkeypatch.delitem(sys.modules, "pipeline.wheel_kernels")
