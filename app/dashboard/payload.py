@@ -43,7 +43,7 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         "time_s": shown.time_s,
         "pose": _rounded(estimate.T_map_base.as_array()),
         "odom": _rounded(frame.T_odom_base.as_array()),
-        "sigma_xy": round(float(np.sqrt(np.mean(np.diagonal(estimate.covariance)[:2]))), _DIGITS),
+        "sigma_xy": round(estimate.sigma_xy, _DIGITS),
         "n_eff": round(estimate.n_eff, 1),
         "health": health_payload(frame.health),
         "trees": trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),

@@ -13,7 +13,7 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import Noise, OdometryTrust, wrapped
 from pipeline.slam.rigid_shift_test import FAMILIAR, MANY
-from pipeline.types.records import Health, HealthState
+from pipeline.types.records import SIGMA_XY_MAX, Health, HealthState
 
 # Columns of the statistics of a scan by particle; SHIFT is the deviation x, y [m], yaw [rad] from the
 # odometry.
@@ -338,9 +338,9 @@ def _exponential_mean(mean: float, value: float, newest: float) -> float:
     return mean + newest * (value - mean) if newest else mean
 
 
-# Standard deviations of the position up to which a pose is good, and weak: a third of the usual distance
-# between neighbouring trunks, and that distance, beyond which associations become wrong.
-SIGMA_GOOD, SIGMA_WEAK = 0.5, 1.5  # m
+# Standard deviation of the position up to which a pose is good: a third of the usual distance between
+# neighbouring trunks.
+SIGMA_GOOD = 0.5  # m
 INNOVATION_WEAK = 3.0  # normalised innovation squared; errors are sqrt(3) = 1.7 times their sigma
 FOUND_WEAK, FOUND_LOST = 0.35, 0.2  # minimum share of the known trees in free view that are found
 ODOMETRY_WEAK = 5.0  # sigma; deviation from the odometry
@@ -358,8 +358,8 @@ def pose_health(
 ) -> Health:
     """Return the quality of the pose after a scan.
 
-    The state is "lost" if the standard deviation of the position exceeds SIGMA_WEAK or `is_lost` is True, and
-    "weak" if another rule of `_state_and_reason` applies, else "good".
+    The state is "lost" if the standard deviation of the position exceeds SIGMA_XY_MAX or `is_lost` is True,
+    and "weak" if another rule of `_state_and_reason` applies, else "good".
 
     Args:
         recent: Running statistics after the scan.
@@ -391,8 +391,8 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
     """Return the state and the message of its reason, which is empty for a good pose. The first rule that
     applies decides.
 
-    "lost": `sigma_xy` is above SIGMA_WEAK or NaN; `is_lost`. "weak": a doubt, unless the trees determine the
-    motion reliably; `strange` above 0; `sigma_xy` above SIGMA_GOOD; `found` below FOUND_WEAK; `odometry`
+    "lost": `sigma_xy` is above SIGMA_XY_MAX or NaN; `is_lost`. "weak": a doubt, unless the trees determine
+    the motion reliably; `strange` above 0; `sigma_xy` above SIGMA_GOOD; `found` below FOUND_WEAK; `odometry`
     above ODOMETRY_WEAK; `innovation` above INNOVATION_WEAK; `ambiguous` above AMBIGUOUS_WEAK; `alone` above
     ALONE_WEAK. The rules for `found` and `alone` apply only once a well-known landmark was detected.
 
@@ -401,7 +401,7 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
         sigma_xy: Standard deviation of the position [m].
         doubt: Reason to doubt the odometry, "" for none.
     """
-    if not sigma_xy <= SIGMA_WEAK:
+    if not sigma_xy <= SIGMA_XY_MAX:
         return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than the distance between trees"
     if is_lost(recent):
         return "lost", "the known trees are not found where they should be visible"

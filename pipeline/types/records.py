@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Literal, Protocol
 
@@ -533,6 +533,9 @@ class Landmarks:
 
 
 HealthState = Literal["good", "weak", "lost"]
+#: Standard deviation up to which a position is usable [m]: the usual distance between neighbouring trunks,
+#: beyond which associations become wrong.
+SIGMA_XY_MAX = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -599,6 +602,11 @@ class PoseEstimate:
     health: Health = field(default_factory=Health)
     relative: Float | None = None
     landmark_of: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    @property
+    def sigma_xy(self) -> float:
+        """Root mean square of the standard deviations of x and y in the map [m]."""
+        return float(np.sqrt(0.5 * (self.covariance[0, 0] + self.covariance[1, 1])))
 
     @property
     def local_covariance(self) -> Float:
@@ -715,8 +723,14 @@ class Frame:
 
     @property
     def health(self) -> Health:
-        """Quality of the pose."""
-        return self.estimate.health
+        """Quality of the pose: that of the estimate, whose `sigma_xy` is relative to nearby landmarks, but
+        not "good" if the standard deviation of the position in the map exceeds SIGMA_XY_MAX."""
+        health, sigma_xy = self.estimate.health, self.estimate.sigma_xy
+        if health.state != "good" or sigma_xy <= SIGMA_XY_MAX:
+            return health
+        return replace(
+            health, state="weak", reason=f"the position in the map is uncertain by {sigma_xy:.1f} m"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

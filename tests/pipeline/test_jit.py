@@ -250,7 +250,7 @@ def test_all_machines_of_an_architecture_compile_for_one_target(tmp_path, machin
 
 def test_a_wheel_takes_the_kernels_along_and_an_editable_one_does_not(tmp_path, monkeypatch):
     plugin = types.ModuleType("hatchling.builders.hooks.plugin.interface")
-    plugin.BuildHookInterface = object
+    plugin.BuildHookInterface = object  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, plugin.__name__, plugin)
     monkeypatch.delitem(sys.modules, "pipeline.wheel_kernels", raising=False)
     hook = importlib.import_module("pipeline.wheel_kernels").KernelsInWheel()
@@ -263,7 +263,7 @@ def test_a_wheel_takes_the_kernels_along_and_an_editable_one_does_not(tmp_path, 
         ("standard", {str(kernel): "pipeline/slam/__pycache__/a.f-1.py311.nbi"}),
         ("editable", {}),
     ):
-        build = {"force_include": {}}
+        build: dict[str, dict[str, str]] = {"force_include": {}}
         hook.initialize(version, build)
         assert build["force_include"] == files
     monkeypatch.delitem(sys.modules, "pipeline.wheel_kernels")

@@ -20,12 +20,12 @@ const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans ta
 const FIGURES = {
   trees: ["trees", "", (s) => [String(s.trees - rejected()), ...labelOfTrees(s)]],
   points: ["points", "", (s) => [s.cloud ? s.cloud.points.toLocaleString("en") : NONE]],
-  health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health] ?? "soon", reason(s)]],
+  health: ["SLAM", "", (s) => health(s)],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  sigma: ["pose sigma", "cm", (s) => [state.map && TESTED.includes(s.health) ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
+  sigma: ["pose sigma", "", (s) => [state.map && TESTED.includes(s.health) ? length(state.map.sigma_xy) : NONE], "minor"],
   f1: ["F1 of the map", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
 const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
@@ -55,11 +55,20 @@ function ofScan() {
 // Explanations of the first states.
 const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first scans", static: "SLAM: the sensor has not moved" };
 
-function reason({ health }) {
-  if (SOON[health]) return SOON[health];
+// A state that is worse than that of the newest scan stays for a moment while the run plays, so that a doubt about a few
+// scans can be read.
+const HELD_FOR = 2000; // [ms]
+let held = { state: "good", reason: "", at: -Infinity };
+
+function health({ health: word, state: phase }) {
   const known = state.map?.health;
-  return known && known.state === health && known.reason ? known.reason : "SLAM health";
+  const now = { state: word, reason: known?.state === word ? known.reason : "", at: performance.now() };
+  const isWorse = TESTED.indexOf(held.state) > TESTED.indexOf(word);
+  if (phase !== "playing" || !isWorse || now.at - held.at > HELD_FOR) held = now;
+  return [held.state, { good: "good", weak: "warn", lost: "bad" }[held.state] ?? "soon", SOON[held.state] || held.reason || "SLAM health"];
 }
+
+const length = (metres) => (metres < 1 ? `${figure(100 * metres)} cm` : `${figure(metres)} m`);
 
 function healthFigures() {
   const h = state.map?.health;
@@ -67,7 +76,7 @@ function healthFigures() {
   if (state.status.health === "static") return SOON.static;
   return [h.reason && `${h.state}: ${h.reason}`, `N_eff ${figure(h.n_eff)}, ${h.ancestors} ancestors`,
     `${h.detections} detections, ${figure(h.recognised)} associated, ${figure(h.ambiguous)} ambiguous`,
-    `normalised innovation ${figure(h.innovation)} (1 expected)`, `pose sigma ${figure(100 * state.map.sigma_xy)} cm, ${figure(h.sigma_yaw_deg)}°`,
+    `normalised innovation ${figure(h.innovation)} (1 expected)`, `pose sigma ${length(state.map.sigma_xy)} in the map, ${length(h.sigma_xy_m)} from the trees, ${figure(h.sigma_yaw_deg)}°`,
     `${figure(h.odometry_sigmas)} sigma from the odometry`].filter(Boolean).join("\n");
 }
 
@@ -143,9 +152,16 @@ function showState() {
   setText(byId("recording"), `${recording.startsWith("not") ? "⚠" : "●"} ${recording.split(",")[0].split(":")[0]}`);
   byId("recording").title = recording;
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
-  const quiet = state.status?.state === "playing" && performance.now() - state.heardAt > (performance.now() - compiledAt < COMPILED_FOR ? 4 : 1) * OLD_AFTER;
+  const quiet = isOld();
   byId("figures").classList.toggle("old", quiet);
   showNotice(quiet);
+  showWay();
+}
+
+// Whether a run plays and no message came for a while.
+function isOld() {
+  const now = performance.now(), patience = (now - compiledAt < COMPILED_FOR ? 4 : 1) * OLD_AFTER;
+  return state.status?.state === "playing" && now - state.heardAt > patience;
 }
 
 // Obstacles ahead of the robot, below the strip so that nothing moves. A screen reader announces changes of the zone, not of
@@ -154,8 +170,8 @@ const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "
 
 function showWay() {
   const clearance = state.map?.clearance;
-  // A finished run does not drive on, so a path that is not visible does not matter.
-  const quiet = NO_FIGURES.includes(state.status?.state) || (state.status?.state === "finished" && clearance?.zone === "unknown");
+  // Only a robot that drives on has something in its way, and only a scan of now shows it.
+  const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld();
   const text = clearance && !quiet && WAY[clearance.zone];
   byId("way").hidden = !text;
   byId("way").dataset.zone = clearance?.zone ?? "";

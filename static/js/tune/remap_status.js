@@ -21,17 +21,17 @@ export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The
   note, progress, all);
 
 function resultText(remapped) {
-  const { after, scans, changes } = remapped;
+  const { after, scans, time_s: end, changes } = remapped;
   const number = (kind) => changes.filter((change) => change.kind === kind).length;
   const parts = Object.keys(SIGNS).map((kind) => number(kind) && `${number(kind)} ${kind}`).filter(Boolean);
-  return `Re-mapped${endText(scans)}: ${count(after, "tree")}, ${parts.length ? parts.join(", ") : "none moved"}.`;
+  return `Re-mapped${endText(scans, end)}: ${count(after, "tree")}, ${parts.length ? parts.join(", ") : "none moved"}.`;
 }
 
 // The re-mapping ends at the current scan; later scans are mapped when the run reaches them.
-function endText(scans) {
+function endText(scans, end) {
   const all = state.status?.scans ?? null;
   const partial = all === null ? state.status?.state !== "finished" : scans < all;
-  return partial ? ` to ${clock(state.status?.time_s)}` : "";
+  return partial ? ` to ${clock(end)}` : "";
 }
 
 const FIRST = 2; // [s] without an estimate: kernels are loaded and the current scan is mapped

@@ -20,7 +20,6 @@ from pipeline.slam.pose_quality import (
     RECOGNISED,
     SHIFT,
     SIGMA_GOOD,
-    SIGMA_WEAK,
     STATISTICS,
     STRANGE_LOST,
     TREE_MOTION_MAX,
@@ -35,6 +34,7 @@ from pipeline.slam.pose_quality import (
     update_statistics,
 )
 from pipeline.slam.rigid_shift_test import MANY
+from pipeline.types.records import SIGMA_XY_MAX
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam.model_copy(update={"update_distance": 0.0})
@@ -125,7 +125,7 @@ def test_driving_where_nothing_is_known_is_weak():
     [
         (RunningStatistics(), 0.1, "", "good"),
         (RunningStatistics(), 1.01 * SIGMA_GOOD, "", "weak"),
-        (RunningStatistics(), 1.01 * SIGMA_WEAK, "", "lost"),
+        (RunningStatistics(), 1.01 * SIGMA_XY_MAX, "", "lost"),
         (RunningStatistics(), float("nan"), "", "lost"),
         (RunningStatistics(), 0.1, "no odometry", "weak"),
         (RunningStatistics(innovation=1.01 * INNOVATION_WEAK), 0.1, "", "weak"),
