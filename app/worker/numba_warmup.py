@@ -164,7 +164,9 @@ def warm_tree_map() -> None:
         clusters.record(mapper.process(step))
     known = KnownMap(stems, clusters, mapper.path, None)
     preview_trees(known, stems.replace({"tracking.hits_to_confirm": 4}))
-    tree_columns(Tracker(stems.tracking).classify(0, no_columns(), stems.classification))
+    tracker = Tracker(stems.tracking)
+    tree_columns(tracker.classify(0, no_columns(), stems.classification))
+    tracker.classify_new(no_columns())
 
 
 def _stems() -> Iterator[Step]:

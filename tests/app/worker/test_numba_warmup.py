@@ -39,9 +39,9 @@ before = seen()
 assert len(before) > 20, before
 warm_up()
 session = new_session()
-session.open(Open("sim:stand?duration=1", "auto", 0))
+session.open(Open("sim:stand?duration=3", "auto", 0))
 session.set_parameters(Parameters(), 0)
-session.advance(10)
+session.advance(30)
 while session.pace == "hurry":
     session.work()
 for revision, change in enumerate([{"classification.tree_share": 0.7}, {"detection.e_max": 20.0}]):
