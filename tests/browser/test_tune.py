@@ -62,18 +62,28 @@ def test_a_slider_moves_by_its_step_and_to_its_end(dashboard: Dashboard):
     assert dashboard.state == "paused"
 
 
-def test_a_refused_value_is_reported_and_reverted(dashboard: Dashboard):
+def test_a_refused_value_stays_with_the_reason_below_it_until_another_is_accepted(dashboard: Dashboard):
     page = dashboard.page
     lowest = value(page, "detection.e_min")
+    reason = page.locator("[data-parameter='detection.e_min'] .error")
     for typed, words in (("900", "must be less than"), ("many", "is not a number"), ("-3", "greater than")):
         lowest.fill(typed)
         lowest.press("Enter")
-        expect(page.locator("#tune-error")).to_contain_text(words)
-        expect(lowest).to_have_value("1")
+        expect(reason).to_contain_text(words)
+        expect(lowest).to_have_value(typed)
+        box, below = lowest.bounding_box(), reason.bounding_box()
+        assert box is not None
+        assert below is not None
+        assert 0 <= below["y"] - box["y"] - box["height"] < 20
+    assert dashboard.ask("/api/parameters")["values"]["detection.e_min"] == 1
     dashboard.errors.clear()  # the browser logs an answer that refuses
+    lowest.press("Escape")
+    expect(reason).to_be_hidden()
+    expect(lowest).to_have_value("1")
     lowest.fill("1.5")
     lowest.press("Enter")
-    expect(page.locator("#tune-error")).to_be_hidden()
+    dashboard.until_server("/api/parameters", "it.values['detection.e_min'] === 1.5")
+    expect(reason).to_be_hidden()
 
 
 def test_parameters_are_found_by_words(dashboard: Dashboard):

@@ -93,10 +93,22 @@ function showWarnings(warnings) {
   button.hidden = !warnings.length;
   if (!warnings.length) closeWarnings();
   setText(button, `⚠ ${count(warnings.length, "warning")}`);
-  const list = byId("warnings");
-  if (list.dataset.shown === warnings.join("\n")) return;
-  list.dataset.shown = warnings.join("\n");
-  list.replaceChildren(...warnings.map((text) => el("li", { text })));
+  const groups = grouped(warnings), list = byId("warnings"), shown = JSON.stringify(groups);
+  if (list.dataset.shown === shown) return;
+  list.dataset.shown = shown;
+  list.replaceChildren(...groups.map(({ text, number, at }) => el("li", { text }, number > 1 ? ` (${number} times)` : "",
+    at === undefined ? "" : el("button", { class: "quiet small", type: "button", text: clock(at), title: "Show the scan of this warning", onclick: () => seek(at) }))));
+}
+
+// Warnings that differ in numbers only are one, with the newest text, how many there are, and the time of the last.
+function grouped(warnings) {
+  const groups = new Map();
+  for (const text of warnings) {
+    const key = text.replace(/\d+/g, "0");
+    const at = state.events.findLast(({ kind, text: of }) => kind === "warning" && text.startsWith(of))?.t;
+    groups.set(key, { text, number: (groups.get(key)?.number ?? 0) + 1, at });
+  }
+  return [...groups.values()];
 }
 
 // The saved set in force, or the preset with the number of changed values.

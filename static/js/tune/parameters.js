@@ -1,4 +1,5 @@
-// Parameters: their declarations, and the requests that change them. A refused request is shown as `tuning.error`.
+// Parameters: their declarations, and the requests that change them. Why a value was refused is in `tuning.refused`, the failure of
+// another request in `tuning.error`.
 
 import { myName } from "../annotate/annotations.js";
 import { get, patch, post } from "../core/api.js";
@@ -10,6 +11,7 @@ export const tuning = {
   specs: [], // [{name, stage, title, unit, doc, kind, minimum, maximum, step, choices, default}]
   presets: [], // [{name, doc}]
   error: "",
+  refused: {}, // by the name of a parameter: why its last value was refused; empty if it was not
 };
 const SET_NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .+-]{0,39}$/u;
 let last = Promise.resolve(), waiting = {}, sending = false;
@@ -50,7 +52,8 @@ export async function setValue(name, value, gesture = "") {
   while (Object.keys(waiting).length) {
     const [[first, sent]] = Object.entries(waiting);
     delete waiting[first];
-    await attempt(() => patch("/api/parameters", { changes: { [first]: sent.value }, gesture: sent.gesture }));
+    const change = { changes: { [first]: sent.value }, gesture: sent.gesture };
+    await attempt(async () => { tuning.refused[first] = await patch("/api/parameters", change).then(() => "", ({ message }) => message); });
   }
   sending = false;
   changed("tuning");

@@ -1,7 +1,7 @@
 // The row of a parameter: slider, text box, and reset to the preset.
 
-import { el } from "../core/dom.js";
-import { isChanged, isMoving, newGesture, redo, refuse, reset, setValue, shown, undo, valueOf } from "./parameters.js";
+import { el, setText } from "../core/dom.js";
+import { isChanged, isMoving, newGesture, redo, reset, setValue, shown, tuning, undo, valueOf } from "./parameters.js";
 import { beginDrag, FINE, fromPlace, pressed, toPlace } from "./slider.js";
 
 const THUMB = 16; // [px] width of the thumb
@@ -14,7 +14,7 @@ export function rowOf(spec, ...further) {
     spec.unit ? el("small", { text: ` ${spec.unit}` }) : "");
   const [inputs, fill] = spec.kind === "bool" ? box(spec, id) : spec.kind === "choice" ? list(spec, id) : spec.kind === "name" ? word(spec, id) : number(spec, id);
   const node = el("div", { class: "tune-row", "data-parameter": spec.name, "data-words": `${spec.name} ${spec.title} ${spec.doc} ${spec.stage}`.toLowerCase() },
-    el("span", { class: "tune-name" }, label, ...further), ...inputs, back);
+    el("span", { class: "tune-name" }, label, ...further), ...inputs.slice(0, 2), back, ...inputs.slice(2));
   const show = (wanted) => {
     const different = isChanged(spec.name);
     node.classList.toggle("changed", different);
@@ -44,10 +44,22 @@ function word(spec, id) {
 function number(spec, id) {
   const typed = el("input", { id, type: "text", inputmode: "decimal", autocomplete: "off", spellcheck: "false" });
   const slider = el("input", { type: "range", min: "0", max: String(FINE), step: "1", "aria-label": `${spec.title}, slider` });
+  const refused = el("p", { id: `${id}-refused`, class: "error", role: "alert", hidden: true });
+  typed.setAttribute("aria-describedby", refused.id);
   let known = "";
+  const refuse = (reason) => {
+    tuning.refused[spec.name] = reason;
+    fill(valueOf(spec.name));
+  };
   const fill = (value) => {
+    if (String(value) !== known) tuning.refused[spec.name] = ""; // another value came after the refused one
     known = String(value);
-    if (document.activeElement !== typed || !typed.classList.contains("dirty")) typed.value = known;
+    const reason = tuning.refused[spec.name];
+    setText(refused, reason);
+    refused.hidden = !reason;
+    typed.setAttribute("aria-invalid", String(Boolean(reason)));
+    const isTyping = document.activeElement === typed && typed.classList.contains("dirty");
+    if (!isTyping && !reason) typed.value = known; // what was typed and refused remains
     slider.value = String(toPlace(spec, value));
     slider.setAttribute("aria-valuetext", shown(value, spec));
   };
@@ -77,10 +89,9 @@ function number(spec, id) {
     typed.classList.remove("clean");
     const text = typed.value.trim().replace(",", ".");
     const value = Number(text);
-    if (text === "" || !Number.isFinite(value)) {
-      refuse(`${spec.title}: “${typed.value.trim().slice(0, 30)}” is not a number.`);
-      typed.value = known;
-    } else if (text !== known) await setValue(spec.name, value);
+    if (text === "" || !Number.isFinite(value)) refuse(`“${typed.value.trim().slice(0, 30)}” is not a number.`);
+    else if (text === known) refuse("");
+    else await setValue(spec.name, value);
   };
   typed.addEventListener("input", () => typed.classList.add("dirty"));
   typed.addEventListener("change", take);
@@ -88,12 +99,12 @@ function number(spec, id) {
     if (event.key === "Enter") take();
     else if (event.key === "Escape") {
       typed.classList.remove("dirty");
-      typed.value = known;
+      refuse("");
     } else if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !typed.classList.contains("dirty")) {
       event.preventDefault(); // no typed text to undo, so the parameter change is undone
       if (event.shiftKey) redo();
       else undo();
     }
   });
-  return [[slider, typed], fill];
+  return [[slider, typed, refused], fill];
 }
