@@ -130,3 +130,23 @@ def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: 
     assert passed is not None, notice
     assert int(passed[1]) >= 98, "from its start, not from the opening of the page"
     expect(page.locator("#state b")).to_have_text("Paused")
+
+
+WARN = """async () => {
+  const { state, changed } = await import("/static/js/core/store.js");
+  const warnings = [1, 2, 3].map((n) => `Scan ${n} has ${10 * n} points only`).concat("The clock went back");
+  state.status = { ...state.status, warnings };
+  state.events = [...state.events, { t: 12.0, kind: "warning", text: "Scan 3 has 30 points only" }];
+  changed("status");
+}"""
+
+
+def test_equal_warnings_are_one_line_that_leads_to_the_last(dashboard: Dashboard):
+    page = dashboard.page
+    page.evaluate(WARN)
+    page.locator("#warnings-button").click()
+    lines = page.locator("#warnings li")
+    expect(lines).to_have_count(2)
+    expect(lines.first).to_contain_text("Scan 3 has 30 points only (3 times)")
+    lines.first.get_by_role("button", name="0:12.0").click()
+    dashboard.until_server("/api/status", "Math.abs(it.time_s - 12) < 0.06")
