@@ -6,6 +6,15 @@ from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
 
+# Buttons of the page that the line about the obstacle covers.
+COVERED = """() => {
+  const way = document.querySelector('#way').getBoundingClientRect();
+  const covers = (box) => box.width
+    && box.left < way.right && box.right > way.left && box.top < way.bottom && box.bottom > way.top;
+  return [...document.querySelectorAll('button')].filter(node => covers(node.getBoundingClientRect()))
+    .map(node => node.id || node.textContent);
+}"""
+
 
 def test_a_person_in_the_way_is_reported(dashboard: Dashboard):
     way = dashboard.page.locator("#way")
@@ -18,6 +27,10 @@ def test_a_person_in_the_way_is_reported(dashboard: Dashboard):
             box = way.bounding_box()
             assert box is not None
             assert box["height"] > 20
+            for width, height in ((1440, 900), (1280, 720), (820, 1180), (390, 844), (1260, 720)):
+                dashboard.page.set_viewport_size({"width": width, "height": height})
+                dashboard.drawn()
+                assert dashboard.page.evaluate(COVERED) == [], f"{width} px"
         else:
             expect(way).to_be_hidden()
 

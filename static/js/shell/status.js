@@ -16,7 +16,8 @@ const TESTED = ["good", "weak", "lost"]; // the pose was tested by trees; else i
 const OLD_AFTER = 3000; // [ms] without a message while a run plays
 const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans take longer
 
-// title, unit, function of the status that returns [text, class, title], and "minor" if it is hidden first in a narrow strip
+// title, unit, function of the status that returns [text, class, title, unit], all but the text may be left out, and "minor" if it
+// is hidden first in a narrow strip
 const FIGURES = {
   trees: ["trees", "", (s) => [String(s.trees - rejected()), ...labelOfTrees(s)]],
   points: ["points", "", (s) => [s.cloud ? s.cloud.points.toLocaleString("en") : NONE]],
@@ -25,7 +26,7 @@ const FIGURES = {
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  sigma: ["pose sigma", "", (s) => [state.map && TESTED.includes(s.health) ? length(state.map.sigma_xy) : NONE], "minor"],
+  sigma: ["pose sigma", "", (s) => (state.map && TESTED.includes(s.health) ? sigma(state.map.sigma_xy) : [NONE]), "minor"],
   f1: ["F1 of the map", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
 const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
@@ -68,7 +69,8 @@ function health({ health: word, state: phase }) {
   return [held.state, { good: "good", weak: "warn", lost: "bad" }[held.state] ?? "soon", SOON[held.state] || held.reason || "SLAM health"];
 }
 
-const length = (metres) => (metres < 1 ? `${figure(100 * metres)} cm` : `${figure(metres)} m`);
+const sigma = (metres) => (metres < 1 ? [figure(100 * metres), "", "pose sigma", "cm"] : [figure(metres), "", "pose sigma", "m"]);
+const length = (metres) => `${sigma(metres)[0]} ${sigma(metres)[3]}`;
 
 function healthFigures() {
   const h = state.map?.health;
@@ -83,11 +85,10 @@ function healthFigures() {
 function build() {
   const list = byId("figures");
   for (const [name, [title, unit, , rank]] of Object.entries(FIGURES)) {
-    const value = el("span", { text: NONE });
+    const value = el("span", { text: NONE }), small = el("small", { text: unit });
     const label = el("dt", { text: title });
-    const cell = el("div", { class: rank ?? "", "data-figure": name }, label,
-      el("dd", {}, value, unit ? el("small", { text: unit }) : ""));
-    cells[name] = { cell, value, label, title, rank: rank ?? "" };
+    const cell = el("div", { class: rank ?? "", "data-figure": name }, label, el("dd", {}, value, small));
+    cells[name] = { cell, value, label, title, rank: rank ?? "", small, unit };
     list.append(cell);
   }
 }
@@ -96,9 +97,10 @@ function show() {
   const status = state.status;
   if (!status) return;
   for (const [name, [, , read]] of Object.entries(FIGURES)) {
-    const [text, meaning, title] = NO_FIGURES.includes(status.state) ? [NONE] : read(status);
+    const [text, meaning, title, unit] = NO_FIGURES.includes(status.state) ? [NONE] : read(status);
     setText(cells[name].value, text);
     setText(cells[name].label, title ?? cells[name].title);
+    setText(cells[name].small, unit ?? cells[name].unit);
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
   for (const name of OF_DRIVES) cells[name].cell.hidden = isCloud();
