@@ -240,3 +240,12 @@ def test_the_map_dims_the_trees_that_the_filter_leaves_out(dashboard: Dashboard)
     assert drawn("dbh < 1") != whole
     assert drawn("seen > 0 no such word") == whole  # not understood: nothing is left out
     assert drawn("") == whole
+
+
+def test_the_filter_ends_with_the_run(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    page.locator("#find").fill("dbh > 1000")
+    expect(page.locator("#tree-count")).to_contain_text("0 of")
+    dashboard.open("sim:stand?duration=3")
+    expect(page.locator("#find")).to_have_value("")

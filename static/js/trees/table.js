@@ -167,8 +167,21 @@ export function showTrees(condition) {
   fill();
 }
 
+// A filter is of one run: another one would show few trees or none without a visible reason.
+let source = null;
+
+function forgetFilter() {
+  const now = state.status?.source;
+  if (source !== null && now !== source && byId("find").value) {
+    byId("find").value = "";
+    fill();
+  }
+  source = now ?? source;
+}
+
 export function startTable() {
   head();
+  on("status", forgetFilter);
   byId("find").addEventListener("input", fill);
   byId("find").title = HELP;
   const menu = byId("trees-export");
