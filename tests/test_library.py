@@ -34,7 +34,7 @@ def test_a_folder_of_scans_is_mapped(tmp_path: Path, monkeypatch: pytest.MonkeyP
     scans = (record for record in open_source("sim:stand").records() if isinstance(record, Scan))
     for number, scan in enumerate(itertools.islice(scans, 25)):
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scan.points[:, :3].astype(float)))
-        open3d.io.write_point_cloud(str(folder / f"{number:04}.pcd"), cloud)
+        open3d.io.write_point_cloud(folder / f"{number:04}.pcd", cloud)
     result = names_of(PROGRAMS[0])
     head, *trees = result["table"].splitlines()
     assert head.startswith("tree,x_m,y_m")
