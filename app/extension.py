@@ -41,8 +41,9 @@ class Extension:
         takes: Dotted module by the name of a command of the program. The module has `configure(parser)`,
             which adds flags, and `run(arguments)`, which returns the exit code, or None if the command shall
             do the work.
-        web: Adds routes to the application of a dashboard (`app.state.dashboard`, `app.state.settings`);
-            coroutine functions in the list `app.state.closing` are called at its end.
+        web: Adds routes to the application of a dashboard (`app.state.dashboard`, `app.state.settings`),
+            which are tried before those of the program; coroutine functions in the list `app.state.closing`
+            are called at its end.
         page: Folder of JavaScript whose main.js registers parts of the page
             (static/js/shell/extensions.js), with main.css if it has one.
         formats: Returns formats of files and their readers, which are tried after those of the program.

@@ -1,4 +1,5 @@
-"""Files of a finished run for GIS, CAD and spreadsheets: GeoPackage, Shapefile, GeoJSON, DXF, XLSX, GeoTIFF.
+"""Files of a finished run for geographic information systems: GeoPackage and GeoJSON. Extensions write
+further formats, and further layers.
 
 The same run gives the same bytes: time stamps in the files are fixed.
 """
@@ -11,18 +12,17 @@ import math
 import os
 import sqlite3
 import threading
-import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import shapely
 
-from app.batch.georeference import (
+from app.batch.map_frame import (
     LOCAL_NAME,
     WGS84,
     MapFrame,
@@ -32,20 +32,15 @@ from app.batch.georeference import (
     reproject,
 )
 from app.batch.run_folder import read_run, read_terrain
-from app.batch.stand import StandResult
-from app.common.text import version
-from pipeline.errors import SourceError, StemmapError
+from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import geojson
-from pipeline.stand.figures import FIGURES
 from pipeline.types.records import Trees
 
-_DATE = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
+#: Date of all files.
+DATE = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
 # The libraries have settings of the process, which must not change while another thread writes.
 _WRITING = threading.Lock()
-_CELLS_MAX = 25_000_000
-TERRAIN_CELL = 0.5  # m
-CONTOUR_STEP = 0.5  # m
 LOCAL_WKT = (
     f'ENGCRS["{LOCAL_NAME}",EDATUM["origin of the map"],CS[Cartesian,2],'
     'AXIS["x",unspecified,ORDER[1]],AXIS["y",unspecified,ORDER[2]],LENGTHUNIT["metre",1]]'
@@ -90,42 +85,6 @@ TREE_FIELDS = (
     Field("lean_deg", "lean_deg", "deg", "angle of the stem from the vertical"),
     Field("review", "review", "", "state of the review: open, or confirmed or skipped by a person"),
 )
-#: Beginnings of the names of the figures of a plot in a Shapefile, which may end in `_se`.
-_FIGURES_SHORT = {
-    "n_ha": "n_ha",
-    "n_ha_plain": "n_ha_plain",
-    "n_ha_corrected": "n_ha_c",
-    "g_ha": "g_ha",
-    "g_ha_plain": "g_ha_plain",
-    "g_ha_corrected": "g_ha_c",
-    "v_ha": "v_ha",
-    "v_ha_corrected": "v_ha_c",
-    "dg_cm": "dg_cm",
-    "mean_dbh_cm": "dm_cm",
-    "dominant_dbh_cm": "ddom_cm",
-    "sdi": "sdi",
-    "nearest_neighbour_m": "nn_m",
-    "clark_evans": "ce",
-}
-
-
-def _figure_fields() -> Iterator[Field]:
-    """Yield a field for each stand parameter in FIGURES and, unless its name ends with "_plain", one for its
-    standard error with "_se" appended to the name."""
-    for name, (title, unit) in FIGURES.items():
-        short = _FIGURES_SHORT[name]
-        yield Field(name, short, unit, title)
-        if not name.endswith("_plain"):
-            yield Field(f"{name}_se", f"{short}_se", unit, f"standard error of {name}")
-
-
-PLOT_FIELDS = (
-    Field("plot", "plot", "", "name of the plot"),
-    Field("area_m2", "area_m2", "m2", "area of the plot"),
-    Field("seen_m2", "seen_m2", "m2", "observed part of the area"),
-    Field("trees", "trees", "", "number of trees of at least the minimum diameter in the observed part"),
-    *_figure_fields(),
-)
 #: Fields of each layer.
 LAYER_FIELDS = {
     "trees": TREE_FIELDS,
@@ -133,8 +92,6 @@ LAYER_FIELDS = {
         Field("scans", "scans", "", "number of scans"),
         Field("length_m", "length_m", "m", "length of the path"),
     ),
-    "plots": PLOT_FIELDS,
-    "contours": (Field("z_m", "z_m", "m", "height of the contour"),),
 }
 
 
@@ -150,8 +107,6 @@ class ExportedRun:
         columns: Dict from each name of TREE_FIELDS to the rounded values of the trees, shape (T,); NaN for
             unknown values. `review` has texts.
         path: The path in the coordinates of `place`, shape (N, 2) [m].
-        plots: Tuples, one per plot, of name, shape in the coordinates of `place`, and a dict from the names
-            of PLOT_FIELDS except "plot" to values.
         terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
     """
 
@@ -161,7 +116,6 @@ class ExportedRun:
     place: Float
     columns: dict[str, Any]
     path: Float
-    plots: tuple[tuple[str, Any, dict[str, float]], ...]
     terrain: Float
 
     @property
@@ -170,25 +124,21 @@ class ExportedRun:
         return self.frame.crs or LOCAL_WKT
 
 
-def read_for_export(folder: FilePath, of_plots: StandResult | None) -> ExportedRun:
+R = TypeVar("R", bound=ExportedRun)
+#: Writes a run to a file.
+Writer = Callable[[R, FilePath], None]
+
+
+def read_for_export(folder: FilePath) -> ExportedRun:
     """Return a run with its values for export; rejected trees are left out.
 
     Args:
         folder: Folder of the run.
-        of_plots: Stand figures of the run on plots, which are exported with them; None for no plots.
 
     Raises:
         StemmapError: A file of the run is missing or damaged.
     """
     run, frame = read_run(folder), read_map_frame(folder)
-    shapes: list[tuple[str, Any, dict[str, float]]] = []
-    if of_plots is not None:
-        for plot in of_plots.plots:
-            f = of_plots.figures[plot.name]
-            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": f.trees}
-            for name, estimate in f.values.items():
-                figures.update({name: estimate.value, f"{name}_se": estimate.se})
-            shapes.append((plot.name, shapely.transform(plot.shape, frame.to_crs), figures))
     trees, path, terrain = run.trees, run.path, read_terrain(folder)
     ground = heights_at(terrain, trees.position) + frame.z
     unknown = np.full(len(trees.number), np.nan)
@@ -217,10 +167,10 @@ def read_for_export(folder: FilePath, of_plots: StandResult | None) -> ExportedR
     }
     path_xy = frame.to_crs(np.stack([path.x, path.y], axis=1))
     place = frame.to_crs(trees.position)
-    return ExportedRun(run.uri, trees, frame, place, columns, path_xy, tuple(shapes), terrain)
+    return ExportedRun(run.uri, trees, frame, place, columns, path_xy, terrain)
 
 
-def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
+def export_run(run: R, file: FilePath, writers: Mapping[str, Writer[R]]) -> list[FilePath]:
     """Write a run to a file whose suffix gives the format; return all files that were written, ordered by
     name. Existing files are replaced.
 
@@ -228,20 +178,19 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
 
     Args:
         run: The run.
-        file: File with a suffix of WRITERS; its folder must exist. A Shapefile has further files in that
+        file: File with a suffix of `writers`; its folder must exist. Some formats have further files in that
             folder.
+        writers: Dict from suffixes to what writes these files, such as WRITERS.
 
     Raises:
-        StemmapError: The suffix is unknown, a package is missing, the terrain covers too large an area, or
-            the run lacks what the format shows: a GeoTIFF needs terrain and, unless the map is local, an EPSG
-            code.
+        StemmapError: The suffix is unknown, a package is missing, or the run lacks what the format shows.
         OSError: The file cannot be written.
     """
-    writer = WRITERS.get(file.suffix.lower())
+    writer = writers.get(file.suffix.lower())
     if writer is None:
         raise StemmapError(
             f"{file.name!r} has an unknown format",
-            remedy=f"Formats: {', '.join([*WRITERS, '.laz'])}, or tree-manager. "
+            remedy=f"Formats: {', '.join([*writers, '.laz'])}, or tree-manager. "
             "Tables (.csv) are in the folder of the run.",
         )
     with _WRITING, TemporaryDirectory(prefix=".export-", dir=file.parent) as folder:
@@ -253,33 +202,33 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
     return written
 
 
-def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
+def export_bytes(run: R, suffix: str, writers: Mapping[str, Writer[R]]) -> tuple[bytes, str]:
     """Return the bytes of an exported file and its name, such as trees.gpkg. Several files, as of a
     Shapefile, are one zip archive (trees_shp.zip) of the files of `export_run`.
 
     Args:
         run: The run.
-        suffix: One of WRITERS.
+        suffix: One of `writers`.
+        writers: As for `export_run`.
 
     Raises:
         StemmapError, OSError: See `export_run`.
     """
     with TemporaryDirectory(prefix="stemmap-export-") as folder:
-        written = export_run(run, FilePath(folder) / f"trees{suffix}")
+        written = export_run(run, FilePath(folder) / f"trees{suffix}", writers)
         if len(written) == 1:
             return written[0].read_bytes(), written[0].name
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
             for file in written:
-                archive.writestr(zipfile.ZipInfo(file.name, _DATE.timetuple()[:6]), file.read_bytes())
+                archive.writestr(zipfile.ZipInfo(file.name, DATE.timetuple()[:6]), file.read_bytes())
         return packed.getvalue(), f"trees_{suffix.lstrip('.')}.zip"
 
 
-def _layers(run: ExportedRun) -> dict[str, Any]:
+def layers_of(run: ExportedRun) -> dict[str, Any]:
     """Return a dict from the name of each layer to its GeoDataFrame in the coordinates of the files: `trees`,
-    also without trees; `path` if it has at least two positions; `plots` and `contours` if there are any. The
-    columns are LAYER_FIELDS and the geometry. Raises StemmapError if a package is not installed or the
-    terrain covers too large an area."""
+    also without trees, and `path` if it has at least two positions. The columns are LAYER_FIELDS and the
+    geometry. Raises StemmapError if a package is not installed."""
     geopandas = gis_package("geopandas", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -293,44 +242,28 @@ def _layers(run: ExportedRun) -> dict[str, Any]:
             geometry=[shapely.LineString(run.path)],
             crs=run.crs,
         )
-    if run.plots:
-        layers["plots"] = geopandas.GeoDataFrame(
-            _plot_table(run),
-            geometry=[shape for _, shape, _ in run.plots],
-            crs=run.crs,
-        )
-    lines = contours(run)
-    if lines:
-        layers["contours"] = geopandas.GeoDataFrame(
-            {"z_m": [z for z, _ in lines]},
-            geometry=[shapely.LineString(line) for _, line in lines],
-            crs=run.crs,
-        )
     return layers
 
 
-def _plot_table(run: ExportedRun) -> dict[str, Any]:
-    """Return a dict from each name of PLOT_FIELDS to the values of the plots, rounded to four decimals; NaN
-    if unknown."""
-    table: dict[str, Any] = {"plot": [name for name, _, _ in run.plots]}
-    for field in PLOT_FIELDS[1:]:
-        table[field.name] = np.array([round(figures[field.name], 4) for _, _, figures in run.plots])
-    return table
-
-
-def _write_layers(run: ExportedRun, file: FilePath) -> None:
-    """Write a GeoPackage with the layers of `_layers`, which also raises, and their styles."""
+def write_geopackage(layers: Mapping[str, Any], file: FilePath, styles: Mapping[str, str]) -> None:
+    """Write layers (GeoDataFrames by name) as GeoPackage, with a QGIS style for each, see `qml`; StemmapError
+    if a package is not installed."""
     pyogrio = gis_package("pyogrio", "GIS files")
-    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")})
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")})
     try:
-        for name, layer in _layers(run).items():
+        for name, layer in layers.items():
             pyogrio.write_dataframe(layer, file, layer=name, driver="GPKG", append=file.exists())
     finally:
         pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
-    _write_styles(file)
+    _write_styles(file, styles)
 
 
-def _write_styles(file: FilePath) -> None:
+def _write_layers(run: ExportedRun, file: FilePath) -> None:
+    """Write a GeoPackage with the layers of `layers_of`, which also raises, and their styles."""
+    write_geopackage(layers_of(run), file, STYLES)
+
+
+def _write_styles(file: FilePath, styles: Mapping[str, str]) -> None:
     """Add the styles that QGIS reads from a GeoPackage by default, as a table layer_styles with a row per
     layer."""
     database = sqlite3.connect(file)
@@ -342,7 +275,7 @@ def _write_styles(file: FilePath) -> None:
             "styleName TEXT(30), styleQML TEXT, styleSLD TEXT, useAsDefault BOOLEAN, description TEXT, "
             "owner TEXT(30), ui TEXT(30), update_time DATETIME)"
         )
-        date = _DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")
+        date = DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")
         database.execute(
             "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change, srs_id) "
             "VALUES ('layer_styles', 'attributes', 'layer_styles', '', ?, 0)",
@@ -353,14 +286,14 @@ def _write_styles(file: FilePath) -> None:
                 "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
                 "styleName, styleQML, styleSLD, useAsDefault, description, owner, update_time) "
                 "VALUES ('', '', ?, 'geom', ?, ?, '', 1, 'stemmap', 'stemmap', ?)",
-                (table, table, _STYLES[table], date),
+                (table, table, styles[table], date),
             )
         database.commit()
     finally:
         database.close()
 
 
-def _qml(kind: str, symbol: str, layer: str, properties: dict[str, str]) -> str:
+def qml(kind: str, symbol: str, layer: str, properties: dict[str, str]) -> str:
     """Return a QGIS style with one symbol as XML.
 
     Args:
@@ -387,41 +320,18 @@ _BY_DBH = (
     '<Option name="type" type="QString" value="collection"/></Option></data_defined_properties>'
 )
 #: Styles of the layers: trees are circles with their diameter in metres on the map.
-_STYLES = {
-    "trees": _qml(
+STYLES = {
+    "trees": qml(
         "marker",
         "SimpleMarker",
         _BY_DBH,
         {"color": "47,125,50,255", "outline_color": "20,60,25,255", "size": "0.3", "size_unit": "MapUnit"},
     ),
-    "path": _qml("line", "SimpleLine", "", {"line_color": "31,90,180,255", "line_width": "0.4"}),
-    "plots": _qml(
-        "fill",
-        "SimpleFill",
-        "",
-        {"color": "230,140,20,40", "outline_color": "200,110,0,255", "style": "solid"},
-    ),
-    "contours": _qml("line", "SimpleLine", "", {"line_color": "150,110,70,255", "line_width": "0.15"}),
+    "path": qml("line", "SimpleLine", "", {"line_color": "31,90,180,255", "line_width": "0.4"}),
 }
 
 
-def _write_shapefiles(run: ExportedRun, file: FilePath) -> None:
-    """Write a Shapefile per layer: the trees to `file`, the others to `file` with `_` and the name of the
-    layer. Columns have their short names; a local map has no .prj. Layers and errors as in `_layers`."""
-    pyogrio = gis_package("pyogrio", "GIS files")
-    short = {field.name: field.short for fields in LAYER_FIELDS.values() for field in fields}
-    for name, layer in _layers(run).items():
-        part = file if name == "trees" else file.with_name(f"{file.stem}_{name}{file.suffix}")
-        table = layer.rename(columns=short).set_crs(run.frame.crs or None, allow_override=True)
-        options = {"DBF_DATE_LAST_UPDATE": _DATE.strftime("%Y-%m-%d"), "ENCODING": "UTF-8"}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a file without a reference system
-            pyogrio.write_dataframe(table, part, driver="ESRI Shapefile", layer_options=options)
-        if not run.frame.crs:
-            part.with_suffix(".prj").unlink(missing_ok=True)
-
-
-def _write_geojson(run: ExportedRun, file: FilePath) -> None:
+def write_geojson(run: ExportedRun, file: FilePath) -> None:
     """Write the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map."""
     lon_lat = None
     if run.frame.crs:
@@ -431,215 +341,4 @@ def _write_geojson(run: ExportedRun, file: FilePath) -> None:
     file.write_text(text, encoding="utf-8", newline="")
 
 
-def _write_dxf(run: ExportedRun, file: FilePath) -> None:
-    """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS and CONTOURS. A tree without a
-    diameter is a point without a circle, one without a ground height has z 0. StemmapError if ezdxf or
-    contourpy is not installed, or the terrain covers too large an area."""
-    ezdxf = gis_package("ezdxf", "DXF files")
-    before = ezdxf.options.write_fixed_meta_data_for_testing
-    ezdxf.options.write_fixed_meta_data_for_testing = True
-    try:
-        drawing = ezdxf.new("R2010", units=ezdxf.units.M)
-        drawing.header.custom_vars.append("CRS", run.frame.name)
-        drawing.header.custom_vars.append("Program", f"stemmap {version()}")
-        for layer, colour in (("TREES", 3), ("LABELS", 7), ("PATH", 5), ("PLOTS", 30), ("CONTOURS", 33)):
-            drawing.layers.add(layer, color=colour)
-        space = drawing.modelspace()
-        columns = run.columns
-        for k, (x, y) in enumerate(run.place.tolist()):
-            z = float(np.nan_to_num(columns["z_m"][k]))
-            dbh = float(columns["dbh_cm"][k])
-            space.add_point((x, y, z), dxfattribs={"layer": "TREES"})
-            if math.isfinite(dbh):
-                space.add_circle((x, y, z), 0.005 * dbh, dxfattribs={"layer": "TREES"})
-            text = f"{columns['tree'][k]}" + (f" {dbh:.0f}" if math.isfinite(dbh) else "")
-            label = space.add_text(text, height=0.25, dxfattribs={"layer": "LABELS"})
-            label.set_placement((x + 0.2, y + 0.2, z))
-        if len(run.path) > 1:
-            space.add_lwpolyline(run.path.tolist(), dxfattribs={"layer": "PATH"})
-        for name, shape, _ in run.plots:
-            for part in getattr(shape, "geoms", [shape]):
-                for ring in (part.exterior, *part.interiors):
-                    space.add_lwpolyline(list(ring.coords), close=True, dxfattribs={"layer": "PLOTS"})
-            label = space.add_text(name, height=0.5, dxfattribs={"layer": "PLOTS"})
-            label.set_placement(tuple(shape.centroid.coords[0]))
-        for z, line in contours(run):
-            space.add_lwpolyline(line.tolist(), dxfattribs={"layer": "CONTOURS", "elevation": z})
-        drawing.saveas(file)
-    finally:
-        ezdxf.options.write_fixed_meta_data_for_testing = before
-
-
-def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
-    """Write a workbook with the sheets trees, plots (if there are any), fields and about. StemmapError if
-    xlsxwriter is not installed."""
-    xlsxwriter = gis_package("xlsxwriter", "XLSX files")
-    book = xlsxwriter.Workbook(str(file), {"nan_inf_to_errors": False, "strings_to_formulas": False})
-    book.set_properties({"created": _DATE.replace(tzinfo=None), "comments": f"stemmap {version()}"})
-    bold = book.add_format({"bold": True})
-    first, second = ("east_m", "north_m") if run.frame.crs else ("x_m", "y_m")
-    place = {first: np.round(run.place[:, 0], 3), second: np.round(run.place[:, 1], 3)}
-    number = run.columns["tree"]
-    _sheet(book, "trees", {"tree": number, **place, **run.columns}, bold)
-    if run.plots:
-        _sheet(book, "plots", _plot_table(run), bold)
-    axes = tuple(Field(name, "", "m", f"coordinate in {run.frame.name}") for name in (first, second))
-    rows = [
-        (field, layer)
-        for layer, fields in LAYER_FIELDS.items()
-        for field in ((*fields, *axes) if layer == "trees" else fields)
-    ]
-    units = {
-        "field": [field.name for field, _ in rows],
-        "unit": [field.unit for field, _ in rows],
-        "meaning": [field.meaning for field, _ in rows],
-        "layer": [layer for _, layer in rows],
-    }
-    _sheet(book, "fields", units, bold)
-    about = {
-        "program": f"stemmap {version()}",
-        "source": run.uri,
-        "coordinates": run.frame.name,
-        "georeference": run.frame.method_words if run.frame.crs else "none",
-    }
-    _sheet(book, "about", {"what": list(about), "value": list(about.values())}, bold)
-    book.close()
-
-
-def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # noqa: ANN401
-    """Add a sheet with a column per entry of a table; values that are not finite are empty cells.
-
-    Args:
-        book: Workbook of xlsxwriter.
-        name: Name of the sheet.
-        table: Dict from the title of each column to its values, strings or numbers; columns may differ in
-            length.
-        bold: Format of the titles.
-    """
-    sheet = book.add_worksheet(name)
-    sheet.freeze_panes(1, 0)
-    for column, (title, values) in enumerate(table.items()):
-        sheet.write_string(0, column, title, bold)
-        longest = len(title)
-        for row, value in enumerate(values, start=1):
-            if isinstance(value, str):
-                sheet.write_string(row, column, value)
-                longest = max(longest, len(value))
-            elif math.isfinite(value):  # a field without a value is empty
-                sheet.write_number(row, column, float(value))
-        sheet.set_column(column, column, min(longest + 2, 60))
-
-
-def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
-    """Return the heights of the terrain as a north-up raster in the coordinates of the files, shape (rows
-    from north to south, columns from west to east) [m], NaN where unknown, with west and north of its corner
-    [m]; None if there is no terrain. Cells have TERRAIN_CELL metres. A map that is rotated or whose cells are
-    not those of the raster is resampled linearly between the centres of its cells, beyond them from the
-    nearest one, and only within 0.75 cells of one.
-
-    Raises:
-        SourceError: The raster would have more than 25 million cells.
-    """
-    from scipy.interpolate import LinearNDInterpolator
-    from scipy.spatial import cKDTree
-
-    if not len(run.terrain):
-        return None
-    place, z = run.frame.to_crs(run.terrain[:, :2]), run.terrain[:, 2] + run.frame.z
-    cell = TERRAIN_CELL
-    low = np.floor(place.min(axis=0) / cell) * cell
-    high = np.floor(place.max(axis=0) / cell) * cell + cell
-    width, height = np.round((high - low) / cell).astype(int)
-    if width * height > _CELLS_MAX:
-        raise SourceError("the terrain covers too large an area", where=run.uri)
-    raster = np.full((height, width), np.nan)
-    aligned = abs(math.remainder(run.frame.pose.yaw, math.tau)) < 1e-12 and len(
-        np.unique(place, axis=0)
-    ) == len(z)
-    on_grid = np.abs((place - low) / cell - np.floor((place - low) / cell) - 0.5) < 1e-3
-    if aligned and on_grid.all():
-        column, row = np.floor((place - low) / cell).astype(int).T
-        raster[height - 1 - row, column] = z
-    else:
-        x, y = low[0] + (np.arange(width) + 0.5) * cell, high[1] - (np.arange(height) + 0.5) * cell
-        nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        distance, nearest = cKDTree(place).query(nodes)
-        values = z[nearest]
-        if len(z) > 3 and np.linalg.matrix_rank(place - place.mean(axis=0)) == 2:
-            linear = LinearNDInterpolator(place - low, z)(nodes - low)
-            values = np.where(np.isfinite(linear), linear, values)
-        raster = np.where(distance <= 0.75 * cell, values, np.nan).reshape(height, width)
-    return raster, float(low[0]), float(high[1])
-
-
-def contours(run: ExportedRun) -> list[tuple[float, Float]]:
-    """Return (height [m], line, shape (N, 2) [m]) of each contour line, at multiples of CONTOUR_STEP, in the
-    coordinates of the files; [] if there is no terrain or with a single row or column of cells. Lines of
-    fewer than three points are omitted.
-
-    Raises:
-        StemmapError: contourpy is not installed, or the raster would be too large.
-    """
-    found = terrain_raster(run)
-    if found is None or min(found[0].shape) < 2:
-        return []
-    contourpy = gis_package("contourpy", "contours")
-    raster, west, north = found
-    x = west + (np.arange(raster.shape[1]) + 0.5) * TERRAIN_CELL
-    y = north - (np.arange(raster.shape[0]) + 0.5) * TERRAIN_CELL
-    generator = contourpy.contour_generator(x - west, y - north, np.ma.masked_invalid(raster))
-    low, high = np.nanmin(raster), np.nanmax(raster)
-    levels = np.arange(math.ceil(low / CONTOUR_STEP), math.floor(high / CONTOUR_STEP) + 1) * CONTOUR_STEP
-    return [
-        (float(level), line + np.array([west, north]))
-        for level in levels
-        for line in generator.lines(level)
-        if len(line) > 2
-    ]
-
-
-def _write_geotiff(run: ExportedRun, file: FilePath) -> None:
-    """Write the terrain as a GeoTIFF of float32 with NaN as no-data.
-
-    Raises:
-        StemmapError: The run has no terrain, or one that covers too large an area; its reference system has
-            no EPSG code up to 32766; or tifffile is not installed. A local map needs no code.
-    """
-    tifffile = gis_package("tifffile", "GeoTIFF files")
-    found = terrain_raster(run)
-    if found is None:
-        raise StemmapError("the run has no terrain", where=run.uri)
-    raster, west, north = found
-    tags: list[tuple[Any, ...]] = [
-        (33550, "d", 3, (TERRAIN_CELL, TERRAIN_CELL, 0.0), True),  # ModelPixelScale
-        (33922, "d", 6, (0.0, 0.0, 0.0, west, north, 0.0), True),  # ModelTiepoint
-        (42113, "s", 0, "nan", True),  # GDAL_NODATA
-    ]
-    authority, _, code = run.frame.crs.partition(":")
-    if run.frame.crs and (authority != "EPSG" or not code.isdecimal() or int(code) > 32766):
-        raise StemmapError(
-            f"a GeoTIFF needs a reference system with an EPSG code, not {run.frame.crs[:60]}",
-            remedy="Run stemmap georeference with --crs EPSG:CODE",
-        )
-    keys: tuple[int, ...]
-    if run.frame.crs:  # version 1.1.0; projected, pixels are areas, code of the system, metres
-        keys = (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, int(code), 3076, 0, 1, 9001)
-    else:  # user-defined
-        text = "local|"
-        keys = (1, 1, 0, 3, 1024, 0, 1, 32767, 1025, 0, 1, 1, 1026, 34737, len(text), 0)
-        tags.append((34737, "s", 0, text, True))
-    tags.append((34735, "H", len(keys), keys, True))
-    tifffile.imwrite(
-        file, raster.astype(np.float32), compression="zlib", metadata=None, extratags=tags, datetime=False,
-        software="stemmap",
-    )  # fmt: skip
-
-
-WRITERS: dict[str, Callable[[ExportedRun, FilePath], None]] = {
-    ".gpkg": _write_layers,
-    ".shp": _write_shapefiles,
-    ".geojson": _write_geojson,
-    ".dxf": _write_dxf,
-    ".xlsx": _write_xlsx,
-    ".tif": _write_geotiff,
-}
+WRITERS: dict[str, Writer[ExportedRun]] = {".gpkg": _write_layers, ".geojson": write_geojson}

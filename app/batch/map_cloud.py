@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from app.batch.georeference import WGS84, reproject
+from app.batch.map_frame import WGS84, reproject
 from app.batch.map_run import MappingResult
 from app.batch.run_folder import NO_PATH, as_written, score_map, truth_in_metres
 from app.batch.summary import FAR_FROM_PLOT, evaluation_lines
@@ -37,7 +37,7 @@ from pipeline.io.result_files import (
     number_text,
     seen_text,
 )
-from pipeline.stand.seen_area import covered_area
+from pipeline.seen_area import covered_area
 from pipeline.types.records import CloudDescription, Trees, TruthTrees, Verdict, WholeCloud
 
 SLICE_COLUMNS = (

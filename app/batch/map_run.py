@@ -44,7 +44,7 @@ from pipeline.io.result_files import ODOMETRY, RunFiles, seen_text, terrain_text
 from pipeline.jit import on_compiling
 from pipeline.mapper import Mapper
 from pipeline.odometry.odometry_override import OdometryOverride
-from pipeline.stand.seen_area import SeenArea, SeenRecorder, ViewSelection
+from pipeline.seen_area import SeenArea, SeenRecorder, ViewSelection
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
 MEASURED_SCANS = 100_000  # whose times enter the medians

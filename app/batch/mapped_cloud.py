@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.batch.georeference import heights_at, read_map_frame
+from app.batch.map_frame import heights_at, read_map_frame
 from app.batch.run_folder import read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2

@@ -35,7 +35,7 @@ from pipeline.io.result_files import (
     path_rows,
     tree_rows,
 )
-from pipeline.stand.seen_area import CELL, SeenArea
+from pipeline.seen_area import CELL, SeenArea
 from pipeline.types.records import Int, Path, Trees, TruthTrees
 
 LARGEST_FILE = 256 << 20

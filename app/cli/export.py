@@ -1,18 +1,24 @@
-"""`stemmap export`: writes a finished run as files for GIS, CAD, spreadsheets and other tools."""
+"""`stemmap export`: writes a finished run as files for geographic information systems and other tools."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from app.cli.flags import positive_number
-from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, reviewed, stand_parameters
+from app.cli.stored import reviewed
 from pipeline.errors import StemmapError, UsageError
 
-HELP = "write a finished run as GIS, CAD or spreadsheet files, or for other tools"
+if TYPE_CHECKING:
+    from app.batch.export import ExportedRun
+
+HELP = "write a finished run as GIS files, as a cloud, or for other tools"
 REACH = 30.0
 TREE_MANAGER = "tree-manager"
+CLOUD_SUFFIXES = (".las", ".laz")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--to",
         metavar="FILE",
         default=TREE_MANAGER,
-        help="file .gpkg, .shp, .geojson, .dxf, .xlsx, .tif (terrain) or .laz (cloud); or tree-manager",
+        help="file .gpkg, .geojson or .laz (cloud); or tree-manager",
     )
     parser.add_argument(
         "--out", metavar="FOLDER", type=Path, help="new or empty folder, only for tree-manager"
@@ -35,14 +41,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"tree-manager: largest distance of a tree from the pose of its frame (default: {REACH:g} m)",
     )
     parser.epilog = (
-        "GeoPackage: layers trees, path, plots and contours, with styles for QGIS. Coordinates are those of\n"
-        "`stemmap georeference`, else local. The same run gives the same bytes.\n"
+        "GeoPackage: layers trees and path, with styles for QGIS. Coordinates are those of the reference\n"
+        "system of the map, else local. The same run gives the same bytes.\n"
         "tree-manager: TreeManagerState_<i>.csv with the trees around each pose, and trajectory.txt, the\n"
         "exchange format of place recognition by stems. `stemmap map FOLDER` reads it.\n"
         "Exit code 3: some trees are too far from the path to be in any frame."
     )
-    add_plot_flags(parser)
-    add_stand_flags(parser, without=("reach",))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -53,8 +57,8 @@ def run(arguments: argparse.Namespace) -> int:
         Exit code: 3 if trees far from the path were left out of tree-manager files, else 0.
 
     Raises:
-        StemmapError: A flag is wrong, the run cannot be read or lacks what the format shows, a package is not
-            installed, or a file of Tree Manager, .las or .laz cannot be written.
+        StemmapError: A flag is wrong, the run cannot be read, a package is not installed, or a file of Tree
+            Manager, .las or .laz cannot be written.
         OSError: A file of another format cannot be written, for example because its folder does not exist.
     """
     with reviewed(arguments.run) as folder:
@@ -63,26 +67,27 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _export(arguments: argparse.Namespace, folder: Path) -> int:
     """Write what --to names for the run in `folder`: the files of the tree manager, its cloud (.las, .laz),
-    or its trees with the figures of the chosen plots, if there are any. --out is only for the tree manager
-    (UsageError). Returns and raises as `run`."""
+    or its trees and path. --out is only for the tree manager (UsageError). Returns and raises as `run`."""
     if arguments.to == TREE_MANAGER:
         return _tree_manager(arguments, folder)
-    from app.batch.export import export_run, read_for_export
+    from app.batch.export import WRITERS, export_run, read_for_export
     from app.batch.mapped_cloud import write_cloud
-    from app.batch.stand import stand_of
 
     if arguments.out is not None:
         raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
     file = Path(arguments.to)
-    if file.suffix.lower() in (".las", ".laz"):
+    if file.suffix.lower() in CLOUD_SUFFIXES:
         print(f"{write_cloud(folder, file):,} points in {file}")
         return 0
-    plots, parameters = chosen_plots(arguments), stand_parameters(arguments)
-    exported = read_for_export(folder, stand_of(folder, parameters, plots) if plots else None)
-    written = export_run(exported, file)
+    exported = read_for_export(folder)
+    print_written(exported, export_run(exported, file, WRITERS))
+    return 0
+
+
+def print_written(exported: ExportedRun, written: Sequence[Path]) -> None:
+    """Print the number of trees, their reference system and the files of an export."""
     frame = exported.frame.title
     print(f"{len(exported.place)} trees in {frame} coordinates: {', '.join(map(str, written))}")
-    return 0
 
 
 def _tree_manager(arguments: argparse.Namespace, folder: Path) -> int:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from app.batch.run_edits import SAME_THING
 from app.store.async_store import AsyncStore
-from app.store.records import FRAME, KINDS, PLOT, SKIPPED, Annotation, Content, StaleError, as_truth
+from app.store.records import FRAME, KINDS, SKIPPED, Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
 
@@ -144,7 +144,7 @@ class AnnotationEditor:
         run: Number of the run in the store, None while none is open.
         rows: The annotations of trees and other objects.
         skipped: The annotations of trees about which a person did not decide.
-        plots: The annotations that are plots.
+        others: The annotations of classes of extensions.
         frame: The annotation that is the reference system of the map; None for a local map.
         truth: Ground truth against which the map is scored.
         against: Choice of the ground truth, see `truth_of`.
@@ -212,7 +212,7 @@ class AnnotationEditor:
         """
         self.rows = [row for row in stored if row.content.kind in KINDS]
         self.skipped = [row for row in stored if row.content.kind == SKIPPED]
-        self.plots = [row for row in stored if row.content.kind == PLOT]
+        self.others = [row for row in stored if row.content.kind not in (*KINDS, SKIPPED, FRAME)]
         self.frame = next((row for row in stored if row.content.kind == FRAME), None)
         self.truth = truth_of(self._own, self.rows, self.against)
 
@@ -281,8 +281,8 @@ class AnnotationEditor:
         The keys are `run`, `serial`, `problem` and `against`, the attributes; `used`, the result of
         `counted`; `own`, the number of objects in the ground truth of the source, None if there is none;
         `contradicting`, the result of this function; `same_thing_m`, SAME_THING; `trees` and `skipped`, lists
-        of `row_payload`; `plots`, a list of `plot_payload`; and `georeference`, the `plot_payload` of
-        `frame`, None for a local map.
+        of `row_payload`; `others`, a dict from the class of each of `others` to a list of `values_payload`;
+        and `frame`, the `values_payload` of `frame`, None for a local map.
         """
         return {
             "run": self.run,
@@ -295,8 +295,11 @@ class AnnotationEditor:
             "same_thing_m": SAME_THING,
             "trees": [row_payload(row) for row in self.rows],
             "skipped": [row_payload(row) for row in self.skipped],
-            "plots": [plot_payload(row) for row in self.plots],
-            "georeference": None if self.frame is None else plot_payload(self.frame),
+            "others": {
+                kind: [values_payload(row) for row in self.others if row.content.kind == kind]
+                for kind in sorted({row.content.kind for row in self.others})
+            },
+            "frame": None if self.frame is None else values_payload(self.frame),
         }
 
 
@@ -327,12 +330,12 @@ def row_payload(row: Annotation) -> dict[str, Any]:
     }
 
 
-def plot_payload(row: Annotation) -> dict[str, Any]:
-    """Return the annotation of a plot or of the reference system of the map as a dict of JSON values: the
-    keys of `Content.plot`, and `id`, `who`, `at_s` (time of the last edit [s since 1970]) and `version`."""
+def values_payload(row: Annotation) -> dict[str, Any]:
+    """Return an annotation with values as a dict of JSON values: the keys of `Content.values`, and `id`,
+    `who`, `at_s` (time of the last edit [s since 1970]) and `version`."""
     return {
         "id": row.id,
-        **(row.content.plot or {}),
+        **(row.content.values or {}),
         "who": row.who,
         "at_s": row.at_ns // 1_000_000_000,
         "version": row.version,

@@ -33,7 +33,7 @@ from app.worker import protocol
 from pipeline.config import preset
 from pipeline.config.model import Value
 from pipeline.geometry.columns import GrowingColumns, columns_of
-from pipeline.stand.seen_area import SeenRecorder
+from pipeline.seen_area import SeenRecorder
 from pipeline.types.records import Float, Path, TruthTrees
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.batch.georeference import write_map_frame
-from app.batch.run_edits import placed, reviews_of
+from app.batch.map_frame import write_map_frame
+from app.batch.run_edits import reviews_of
 from app.batch.run_folder import as_written, recorded_time, score_map
 from app.batch.summary import far_truth, unconfirmed_warning
 from app.common.text import changed_values, version
@@ -36,8 +36,7 @@ from pipeline.io.result_files import (
     terrain_rows,
     tree_rows,
 )
-from pipeline.stand.plots import SamplePlot
-from pipeline.stand.seen_area import SeenArea, SeenRecorder, covered_area
+from pipeline.seen_area import SeenArea, SeenRecorder, covered_area
 from pipeline.types.records import Path, Trees, TruthTrees
 
 if TYPE_CHECKING:
@@ -58,7 +57,7 @@ class ShownRun:
         preset, parameters: In force.
         truth: Ground truth in the frame of the map; None if there is none.
         seen: Views of the observed area; those of later scans may be added.
-        edits: The annotations of trees, also skipped ones, and the plots.
+        edits: The annotations, also those of skipped trees and of extensions.
         frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
             none.
     """
@@ -93,7 +92,7 @@ class ShownRun:
             state.parameters,
             dashboard.truth,
             dashboard.seen,
-            (*editor.rows, *editor.skipped, *editor.plots),
+            (*editor.rows, *editor.skipped, *editor.others),
             editor.frame,
         )
 
@@ -107,10 +106,10 @@ class ShownRun:
         """Frame of a whole cloud; None for a run of scans."""
         return self.status.cloud
 
-    def sample_plots(self) -> list[SamplePlot]:
-        """Return the plots in the coordinates of the files."""
-        offset = self.cloud.offset if self.cloud else (0.0, 0.0)
-        return placed([row.content for row in self.edits], offset)
+    @property
+    def offset(self) -> tuple[float, ...]:
+        """Offset of the frame of the map in the coordinates of the files [m]."""
+        return self.cloud.offset if self.cloud else (0.0, 0.0, 0.0)
 
     def reviews(self) -> dict[int, str]:
         """Return a dict from the number of each confirmed tree that has a review to this review, see
@@ -131,19 +130,19 @@ class ShownRun:
 
     @contextmanager
     def folder(self) -> Iterator[FilePath]:
-        """Write the run to a temporary folder, as `stemmap map` and `stemmap georeference` do, and yield it;
-        it is removed afterwards. Raises StemmapError if a file cannot be written, and OSError without a place
-        for the folder."""
+        """Write the run to a temporary folder, as `stemmap map` does, with the reference system that a user
+        gave the map, and yield it; it is removed afterwards. Raises StemmapError if a file cannot be written,
+        and OSError without a place for the folder."""
         with TemporaryDirectory(prefix="stemmap-run-") as name:
             write_texts(FilePath(name), self.texts())
-            if self.frame is not None and self.frame.content.plot is not None:
-                write_map_frame(FilePath(name), self.frame.content.plot["frame"])
+            if self.frame is not None and self.frame.content.values is not None:
+                write_map_frame(FilePath(name), self.frame.content.values["frame"])
             yield FilePath(name)
 
     def texts(self) -> dict[str, str]:
         """Return a dict from the names trees.csv, path.csv, seen.csv, terrain.csv and run.json to the texts
         of these files. terrain.csv has only its header if the newest results have no ground."""
-        ground, offset = self.shown.frame.ground, self.cloud.offset if self.cloud else (0.0, 0.0, 0.0)
+        ground, offset = self.shown.frame.ground, self.offset
         cells = [] if ground is None else list(terrain_rows(ground))
         if self.cloud is not None:
             cells = [

@@ -149,7 +149,7 @@ annotated = sa.Table(
     sa.Column("y", sa.Float, nullable=False),
     sa.Column("kind", sa.String(10), nullable=False),
     sa.Column("dbh", sa.Float),
-    sa.Column("plot", sa.JSON(none_as_null=True), comment="values of a plot or frame"),
+    sa.Column("plot", sa.JSON(none_as_null=True), comment="further values of a class"),
     sa.Column("who", sa.String(60), nullable=False),
     sa.Column("at_ns", sa.BigInteger, nullable=False),
     sa.Column("version", sa.Integer, nullable=False),

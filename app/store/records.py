@@ -19,8 +19,6 @@ KINDS = ("tree", "pole", "person", "bush", "other")
 # Class of an annotation of a tree about which a person did not decide. It states nothing, so it is no
 # ground truth, but it is stored, undone and shared like the others.
 SKIPPED = "skipped"
-# Class of an annotation that is a plot for stand figures.
-PLOT = "plot"
 # Class of the annotation that is the reference system of the map; a run has at most one.
 FRAME = "frame"
 MOST_ANNOTATIONS = 5000
@@ -47,17 +45,17 @@ class Content:
 
     Attributes:
         x, y: Position in the map [m].
-        kind: Class, one of KINDS, SKIPPED, PLOT or FRAME.
+        kind: Class, one of KINDS, SKIPPED or FRAME, or that of an extension.
         dbh: Diameter at breast height [m], None if not measured.
-        plot: Name and shape of a plot, see `pipeline.stand.plots.plot_of`; of a FRAME the values of the route
-            `georeference`; None for other classes.
+        values: JSON values of a FRAME, with the record of a `MapFrame` as `frame`, and of classes of
+            extensions; None for KINDS and SKIPPED.
     """
 
     x: float
     y: float
     kind: str = "tree"
     dbh: float | None = None
-    plot: dict[str, Any] | None = None
+    values: dict[str, Any] | None = None
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
@@ -529,8 +529,8 @@ class Store:
             content: New content; None deletes it.
 
         Raises:
-            UnknownError: The run has no annotation with this id, or it is a plot or reference system and the
-                new content is not, or the reverse.
+            UnknownError: The run has no annotation with this id, or it has `values` and the new content has
+                none, or the reverse.
             StaleError: The annotation has another version or is deleted; the message names author and time of
                 the last change.
         """
@@ -538,7 +538,7 @@ class Store:
             row = connection.execute(
                 select(_annotations).where(_annotations.c.id == id_, _annotations.c.run == run)
             ).one_or_none()
-            if row is None or (content is not None and (content.plot is None) != (row.plot is None)):
+            if row is None or (content is not None and (content.values is None) != (row.plot is None)):
                 raise UnknownError("there is no such annotation", where=f"annotation {id_}")
             if row.version != version or row.deleted:
                 raise _stale(row)
@@ -604,8 +604,14 @@ class Store:
             content: Content of the annotation.
         """
         edit = {"who": author.who, "at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
-        id_ = _inserted(connection, insert(_annotations).values(run=run, **asdict(content), **edit))
-        values = {"step": step, "annotation": id_, "before": None, "after": asdict(content), "made_before": 0}
+        id_ = _inserted(connection, insert(_annotations).values(run=run, **_columns(content), **edit))
+        values = {
+            "step": step,
+            "annotation": id_,
+            "before": None,
+            "after": _columns(content),
+            "made_before": 0,
+        }
         change = _inserted(connection, insert(_changes).values(**values))
         connection.execute(update(_annotations).where(_annotations.c.id == id_).values(made_by=change))
         return id_
@@ -625,8 +631,8 @@ class Store:
         values = {
             "step": step,
             "annotation": row.id,
-            "before": asdict(_content(row)),
-            "after": None if content is None else asdict(content),
+            "before": _columns(_content(row)),
+            "after": None if content is None else _columns(content),
             "made_before": row.made_by,
         }
         change = _inserted(connection, insert(_changes).values(**values))
@@ -741,6 +747,17 @@ def _frame(connection: Connection, run: int) -> Row[Any] | None:
     return connection.execute(
         select(_annotations).where(a.run == run, a.kind == FRAME, a.deleted.is_(False)).limit(1)
     ).one_or_none()
+
+
+def _columns(content: Content) -> dict[str, Any]:
+    """Return a content as values of the columns of annotations, as it is also stored in changes."""
+    return {
+        "x": content.x,
+        "y": content.y,
+        "kind": content.kind,
+        "dbh": content.dbh,
+        "plot": content.values,
+    }
 
 
 def _content(row: Row[Any]) -> Content:

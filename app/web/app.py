@@ -29,7 +29,7 @@ from app.web import uploads
 from app.web.auth import AccessTokens, Guard
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
-from app.web.routes import page, parameters, plots, results, run, runs
+from app.web.routes import page, parameters, results, run, runs
 from app.web.routes.access import Limits, NotPermittedError
 from app.worker.protocol import Open, WorkerBusyError
 from app.worker.supervisor import WorkerProcess
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_ROUTES = (page, run, runs, parameters, results, annotation_routes, plots, uploads)
+_ROUTES = (page, run, runs, parameters, results, annotation_routes, uploads)
 ROUTERS = tuple(module.router for module in _ROUTES)
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], "Scene"]
@@ -105,14 +105,14 @@ def build(
     app.state.open_records = open_records or (lambda: {dashboard.run_recorder.record})
     app.state.uploads, app.state.limits = kept_uploads, Limits()
     app.state.closing = []  # what extensions end before the dashboard
-    for router in ROUTERS:
-        app.include_router(router)
     for name, extension in extensions_on().items():
         if extension.web is not None:
             try:
                 extension.web(app)
             except Exception:  # the dashboard works without it
                 _log.exception("the extension %s is left out of the dashboard", name)
+    for router in ROUTERS:  # after those of extensions, which may answer in their place
+        app.include_router(router)
     return app
 
 

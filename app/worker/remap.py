@@ -33,7 +33,7 @@ from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
 from pipeline.remapping.preview import ClusterTable
 from pipeline.remapping.rerun import Rerun, Segment
-from pipeline.stand.seen_area import ViewSelection
+from pipeline.seen_area import ViewSelection
 from pipeline.types.records import Columns, Float, Float32, Frame, Path, Step, Trees, Verdict
 
 MOST_FRAME_BYTES = 1 << 30  # of the frames of one map; a scan takes 20 to 100 kB

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class Stage(BaseModel):
@@ -423,39 +423,3 @@ class Evaluation(Stage):
 
     reach: float = number(10.0, "Reach", "m", 1.0, 200.0, 0.5)
     """Ground truth farther from every point of the path is not scored."""
-
-
-class Stand(Stage):
-    """Stand figures of a finished map (`stemmap stand`). They do not affect the mapping, so they are not part
-    of the parameters of a run."""
-
-    dbh_min: float = number(0.07, "Minimum diameter", "m", 0.0, 1.0, 0.01)
-    """Thinner trees do not count."""
-
-    class_width: float = number(0.04, "Class width", "m", 0.005, 0.5, 0.005)
-    """Width of the diameter classes."""
-
-    dominant_per_ha: float = number(100.0, "Dominant trees", "1/ha", 1.0, 1000.0, 10.0)
-    """Number of the thickest trees per hectare that give the dominant diameter."""
-
-    reach: float = number(15.0, "Reach", "m", 1.0, 30.0, 0.5)
-    """An area counts as observed up to this distance from its nearest free view."""
-
-    views_min: int = count(2, "Minimum views", "", 1, 100)
-    """Number of scans, half a metre of path apart, with a free view of an observed cell."""
-
-    correction: Literal["half_normal", "none"] = choice("half_normal", "Correction")
-    """half_normal: detection probability over distance; none: every tree in view is found."""
-
-    volume: str = Field(default="", title="Volume formula")
-    """Stem volume in m3 of dbh_cm and height_m, with + - * / ^ ( ), exp, log and sqrt; empty: no volume."""
-
-    @field_validator("volume")
-    @classmethod
-    def _readable(cls, text: str) -> str:
-        """Return the text, which may be empty; FormulaError (a ValueError) if it is not a volume formula."""
-        from pipeline.stand.volume import VolumeFormula
-
-        if text:
-            VolumeFormula.parse(text)
-        return text

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.atomic_files import UNFINISHED
-from pipeline.stand.seen_area import SeenArea
+from pipeline.seen_area import SeenArea
 from pipeline.types.records import Bool, Frame, HeightMap, Int, Path, Trees, Verdict
 
 ROWS = "detections.csv"  # written during the run

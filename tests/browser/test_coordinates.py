@@ -93,7 +93,7 @@ def test_control_points_are_picked_fitted_and_undone(person: Dashboard, tmp_path
     page.locator("#coordinates-east").fill("500100")
     page.locator("#coordinates-apply").click()
     expect(page.locator("#coordinates-result")).to_have_text(re.compile("By hand"))
-    assert person.ask("/api/annotations")["georeference"]["frame"]["east_m"] == 500100.0
+    assert person.ask("/api/annotations")["frame"]["frame"]["east_m"] == 500100.0
     page.locator("#plot-undo").click()
     expect(page.locator("#coordinates-how")).to_have_value("control")
     expect(rows).to_have_count(2)

@@ -36,7 +36,7 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     page.mouse.up()
     expect(rows).to_have_count(1)
     expect(page.locator("#plot-circle")).to_have_attribute("aria-pressed", "false")
-    (plot,) = person.ask("/api/annotations")["plots"]
+    (plot,) = person.ask("/api/annotations")["others"]["plot"]
     assert plot["shape"]["radius"] == pytest.approx(5.0, abs=0.15)
     expect(rows.locator("td").nth(3)).to_contain_text(re.compile(r"\d+ ± "))
 
@@ -49,7 +49,7 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
         canvas.click(position=place_of(person, *corner))
     canvas.press("Enter")
     expect(rows).to_have_count(3)
-    assert [each["shape"]["kind"] for each in person.ask("/api/annotations")["plots"]] == [
+    assert [each["shape"]["kind"] for each in person.ask("/api/annotations")["others"]["plot"]] == [
         "circle",
         "rectangle",
         "polygon",

@@ -18,8 +18,8 @@ from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
 from urllib.parse import parse_qsl, urlencode
 
 import msgspec
-from fastapi import Depends, Query
-from pydantic import Field, ValidationError
+from fastapi import Depends
+from pydantic import Field
 from starlette.exceptions import WebSocketException
 from starlette.requests import HTTPConnection
 from starlette.responses import Response
@@ -33,10 +33,8 @@ from app.store.records import Author
 from app.store.store import Store
 from app.web.auth import Role, is_local, role_of
 from app.web.responses import BadRequestError, Body, Number, UserName, json_reply
-from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
 from pipeline.io.readers import path_of
-from pipeline.stand.volume import LONGEST
 
 #: Largest number of connections of one kind.
 MOST: dict[Role, int] = {"owner": 50, "viewer": 50}
@@ -113,24 +111,6 @@ async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
         yield
 
 
-def _figure_parameters(
-    dbh_min: Annotated[float, Query(ge=0.0, le=1.0)] = 0.07,
-    volume: Annotated[str, Query(max_length=LONGEST)] = "",
-) -> Stand:
-    """Return the parameters of stand figures that a request gives; BadRequestError if the formula is not
-    valid.
-
-    Args:
-        dbh_min: Minimum diameter [m].
-        volume: Volume formula, see `Stand`; empty for none.
-    """
-    try:
-        return Stand(dbh_min=dbh_min, volume=volume.strip())
-    except ValidationError as error:
-        what = error.errors()[0]["msg"].removeprefix("Value error, ")
-        raise BadRequestError(what, remedy='As in "0.00007 * dbh_cm^1.8 * height_m^0.95"') from None
-
-
 @asynccontextmanager
 async def in_thread(context: AbstractContextManager[T]) -> AsyncIterator[T]:
     """Yield the value of a context that is entered in a thread, because entering it writes files; it is left
@@ -139,7 +119,6 @@ async def in_thread(context: AbstractContextManager[T]) -> AsyncIterator[T]:
         yield await asyncio.to_thread(stack.enter_context, context)
 
 
-FigureParameters = Annotated[Stand, Depends(_figure_parameters)]
 CallerRole = Annotated[Role, Depends(_role)]
 #: Returns the source that the request may open for a URI, or None, see `permitted_uri`.
 Permission = Callable[[str], str | None]

@@ -35,11 +35,10 @@ from app.web.responses import (
     json_reply,
     text_reply,
 )
-from app.web.routes.access import Bounds, Dash, FigureParameters, ViewerTurn, in_thread
+from app.web.routes.access import Bounds, Dash, ViewerTurn, in_thread
 from app.worker.course import MOST_ROWS, QUANTITIES
 from app.worker.protocol import Shown
 from pipeline.config import Parameters
-from pipeline.config.stages import Stand
 from pipeline.io.block_file import LARGE
 
 router = APIRouter(prefix="/api")
@@ -126,31 +125,23 @@ async def export_cloud(
 
 
 @router.get("/export/{suffix}", dependencies=[ViewerTurn])
-async def export(
-    suffix: Literal["gpkg", "shp", "geojson", "dxf", "xlsx", "tif"],
-    dashboard: Dash,
-    parameters: FigureParameters,
-) -> Response:
-    """Return the map with the plots of the run as a file for GIS, CAD or spreadsheets, in the reference
-    system of the map; a Shapefile as zip archive. For a run of scans, the bytes are those of `stemmap export`
-    for a run with the same map and plots. 409 before the first map; 422 if a package is missing, the map
-    lacks what the format shows, or all plots are outside of what was observed."""
+async def export(suffix: Literal["gpkg", "geojson"], dashboard: Dash) -> Response:
+    """Return the map as a file for geographic information systems, in the reference system of the map. For a
+    run of scans, the bytes are those of `stemmap export` for a run with the same map. 409 before the first
+    map; 422 if a package is missing."""
     run = ShownRun.of(dashboard)
     with as_bad_request():
-        content, name = await asyncio.to_thread(_exported, run, f".{suffix}", parameters)
+        content, name = await asyncio.to_thread(_exported, run, f".{suffix}")
     return bytes_reply(content, filename=name)
 
 
-def _exported(run: ShownRun, suffix: str, parameters: Stand) -> tuple[bytes, str]:
+def _exported(run: ShownRun, suffix: str) -> tuple[bytes, str]:
     """Return the bytes and the name of the exported file for a suffix with its dot, for example ".gpkg";
     StemmapError where `export` answers 422."""
-    from app.batch.export import export_bytes, read_for_export
-    from app.batch.stand import stand_of
+    from app.batch.export import WRITERS, export_bytes, read_for_export
 
-    plots = run.sample_plots()
     with run.folder() as folder:
-        of_plots = stand_of(folder, parameters, plots) if plots else None
-        return export_bytes(read_for_export(folder, of_plots), suffix)
+        return export_bytes(read_for_export(folder), suffix, WRITERS)
 
 
 @router.get("/evaluation")

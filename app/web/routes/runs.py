@@ -1,67 +1,55 @@
-"""Runs that were mapped before: list, inspect, compare, rename, delete with undo, replay."""
+"""Runs that were mapped before: list, inspect, rename, delete with undo, replay."""
 
 from __future__ import annotations
 
 import asyncio
 import io
-import math
 import os
 import zipfile
 from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import asynccontextmanager
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-import numpy as np
-from fastapi import APIRouter, Path, Query, Request
+from fastapi import APIRouter, Path, Request
 from pydantic import Field
-from shapely.geometry import mapping
 from starlette.responses import Response
 
-from app.batch.georeference import write_map_frame
-from app.batch.run_edits import reviewed_run, stored_frame, stored_plots, stored_reviews
+from app.batch.map_frame import write_map_frame
+from app.batch.run_edits import reviewed_run, stored_frame, stored_reviews
 from app.batch.run_folder import read_run_record
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.shown_run import ShownRun
 from app.sources import opening
 from app.sources.request import request_of_kept
-from app.store.records import NoFilesError, UnknownError
+from app.store.records import UnknownError
 from app.store.store import RunRecords
 from app.web.responses import (
     LARGEST_NUMBER,
     BadRequestError,
     Body,
     Number,
-    bytes_reply,
     error_reply,
     json_reply,
 )
 from app.web.routes.access import (
     Dash,
     Deployment,
-    FigureParameters,
     Permitted,
     ViewerTurn,
     in_thread,
     permitted_request,
 )
 from pipeline.config import PRESETS, preset
-from pipeline.geometry.poses import Pose2
-from pipeline.io.atomic_files import write_texts
-from pipeline.io.result_files import REJECTED, csv_text
-from pipeline.stand.plots import SamplePlot
 
 router = APIRouter(prefix="/api/runs")
 
 _OPEN, _FOLDER = "open", "folder:"
 _MOST_FOLDERS = 500
-# A PDF of a large stand on a busy machine.
-_REPORT_S = 240.0
 # The number of a record, or the name of a finished folder.
-_Key = Annotated[str, Path(min_length=1, max_length=300)]
-_KeyInQuery = Annotated[str, Query(min_length=1, max_length=300)]
+Key = Annotated[str, Path(min_length=1, max_length=300)]
 
 
 class _Name(Body):
@@ -88,74 +76,11 @@ async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
     )
 
 
-@router.get("/compare", dependencies=[ViewerTurn])
-async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b: _KeyInQuery) -> Response:
-    """Compare two runs as `stemmap compare` does, in a child process. The keys name runs of the store or
-    output folders ("folder:NAME"). Maps of the same recording share a frame; others are aligned by the
-    distances between their stems or, if that fails, compared without alignment, and `how` has the reason.
-
-    Return an object with both runs, `a` (the earlier visit) and `b`, see `_whole`; the keys of
-    `app.sources.inspection_process.visits`; `b_path`, the path of b in the frame of a as a list of [x, y]
-    [m]; and `parameters`, see `_changed_parameters`. 404 if a run does not exist, 409 if its files cannot be
-    read.
-    """
-    first, second = await _whole(a, settings, dashboard), await _whole(b, settings, dashboard)
-    async with AsyncExitStack() as stack:
-        paths = (
-            await _visit_path(a, first, stack, settings, dashboard),
-            await _visit_path(b, second, stack, settings, dashboard),
-        )
-        question = {
-            "ask": "visits",
-            "paths": [str(path) for path in paths],
-            "names": [first["name"], second["name"]],
-            "same_frame": bool(first["source"]) and first["source"] == second["source"],
-        }
-        found = await opening.ask(question)
-    path = np.array(second["map"]["path"], np.float64).reshape(-1, 2)
-    return json_reply(
-        {
-            "a": first,
-            "b": second,
-            **found,
-            "b_path": np.round(Pose2(*found["pose"]).apply(path), 3).tolist(),
-            "parameters": _changed_parameters(first["parameters"], second["parameters"]),
-        }
-    )
-
-
 @router.get("/{key}", dependencies=[ViewerTurn])
-async def read_run(key: _Key, dashboard: Dash, settings: Deployment) -> Response:
+async def read_run(key: Key, dashboard: Dash, settings: Deployment) -> Response:
     """Return a run of the store or an output folder ("folder:NAME") with its map, its parameters and their
     history (empty for a folder); 404 if it does not exist, 409 if the folder cannot be read."""
-    return json_reply(await _whole(key, settings, dashboard))
-
-
-@router.get("/{key}/report/{suffix}", dependencies=[ViewerTurn])
-async def report(
-    key: _Key,
-    suffix: Literal["html", "pdf"],
-    dashboard: Dash,
-    settings: Deployment,
-    parameters: FigureParameters,
-    language: Literal["en", "de"] = "en",
-) -> Response:
-    """Return the report of `stemmap report` for a run with its plots; a child process writes it. The key is
-    the number of a record, "folder:NAME", or "open" for the open run. 404 for an unknown run, 409 if there is
-    no report of it, as no PDF without Chromium."""
-    async with _run_folder(key, settings, dashboard) as (folder, plots):
-        with TemporaryDirectory(prefix="stemmap-report-") as there:
-            file = FilePath(there) / f"report.{suffix}"
-            question = {
-                "ask": "report",
-                "path": str(folder),
-                "file": str(file),
-                "language": language,
-                "plots": [(plot.name, mapping(plot.shape)) for plot in plots],
-                "parameters": parameters.model_dump(),
-            }
-            await opening.ask(question, patience_s=_REPORT_S)
-            return bytes_reply(await asyncio.to_thread(file.read_bytes), filename=file.name)
+    return json_reply(await whole_run(key, settings, dashboard))
 
 
 @router.patch("/{number}")
@@ -189,11 +114,11 @@ async def restore(number: Number, dashboard: Dash) -> Response:
 
 
 @router.post("/{key}/replay")
-async def replay(key: _Key, dashboard: Dash, settings: Deployment, permitted: Permitted) -> Response:
+async def replay(key: Key, dashboard: Dash, settings: Deployment, permitted: Permitted) -> Response:
     """Open the source of a run again, with its topics, mounting and final parameters. The response is empty
     (202); the status reports the result. 403 if the file may not be opened by the caller, 404 for an unknown
     run, 409 if its source cannot be opened, 422 if its parameters are not valid in this version."""
-    run = await _whole(key, settings, dashboard)
+    run = await whole_run(key, settings, dashboard)
     request = request_of_kept(
         run["uri"],
         odometry=run.get("odometry") or "auto",
@@ -207,15 +132,13 @@ async def replay(key: _Key, dashboard: Dash, settings: Deployment, permitted: Pe
 
 
 @asynccontextmanager
-async def _run_folder(
-    key: str, settings: Settings, dashboard: Dashboard
-) -> AsyncIterator[tuple[FilePath, list[SamplePlot]]]:
-    """Yield the folder with the result files of a run and its plots; a temporary folder is removed
-    afterwards. The files have the reviews of the trees, and the reference system of the map if there is one.
+async def run_folder(key: str, settings: Settings, dashboard: Dashboard) -> AsyncIterator[FilePath]:
+    """Yield the folder with the result files of a run; a temporary folder is removed afterwards. The files
+    have the reviews of the trees, and the reference system of the map if there is one.
 
     Args:
-        key: "open" or the number of the open run, for its present state; number of another record; or
-            "folder:" and the name of a finished folder.
+        key: See `is_open_run` for the present state of the open run; number of another record; or "folder:"
+            and the name of a finished folder.
         settings: Settings with the data folders.
         dashboard: The dashboard with its store.
 
@@ -223,13 +146,12 @@ async def _run_folder(
         UnknownError: There is no such run.
         StemmapError: The run has no result files, they are damaged, or nothing is mapped yet.
     """
-    if key in (_OPEN, str(dashboard.run_recorder.record)):
-        run = ShownRun.of(dashboard)
-        async with in_thread(run.folder()) as folder:
-            yield folder, run.sample_plots()
+    if is_open_run(key, dashboard):
+        async with in_thread(ShownRun.of(dashboard).folder()) as folder:
+            yield folder
     elif key.startswith(_FOLDER):
         folder = await asyncio.to_thread(_finished_folder, key.removeprefix(_FOLDER), settings)
-        async with _with_edits(folder, dashboard) as found:
+        async with _with_reviews(folder, dashboard) as found:
             yield found
     else:
         number = _number(key)
@@ -238,48 +160,28 @@ async def _run_folder(
         with TemporaryDirectory(prefix="stemmap-run-") as there:
             folder = FilePath(there)
             await asyncio.to_thread(zipfile.ZipFile(io.BytesIO(packed)).extractall, folder)
-            os.utime(folder / "run.json", ns=(changed_ns, changed_ns))  # the date of the map in the report
+            os.utime(folder / "run.json", ns=(changed_ns, changed_ns))  # the date of the map
             source = read_run_record(folder)["source"]
             frame = await dashboard.store.ask(lambda store: stored_frame(store, source))
             if frame is not None:
                 await asyncio.to_thread(write_map_frame, folder, frame)
-            async with _with_edits(folder, dashboard) as found:
+            async with _with_reviews(folder, dashboard) as found:
                 yield found
 
 
+def is_open_run(key: str, dashboard: Dashboard) -> bool:
+    """Return whether a key names the open run: "open", or the number of its record."""
+    return key in (_OPEN, str(dashboard.run_recorder.record))
+
+
 @asynccontextmanager
-async def _with_edits(
-    folder: FilePath, dashboard: Dashboard
-) -> AsyncIterator[tuple[FilePath, list[SamplePlot]]]:
-    """Yield a run with the reviews of its recording, see `reviewed_run`, and the plots of the recording.
-    Raises StemmapError if run.json is damaged or the store cannot be used."""
+async def _with_reviews(folder: FilePath, dashboard: Dashboard) -> AsyncIterator[FilePath]:
+    """Yield a run with the reviews of its recording, see `reviewed_run`. Raises StemmapError if run.json is
+    damaged or the store cannot be used."""
     source = (await asyncio.to_thread(read_run_record, folder))["source"]
     contents = await dashboard.store.ask(lambda store: stored_reviews(store, source))
-    plots = await dashboard.store.ask(lambda store: stored_plots(store, source))
     async with in_thread(reviewed_run(folder, contents)) as reviewed:
-        yield reviewed, plots
-
-
-async def _visit_path(
-    key: str, run: dict[str, Any], stack: AsyncExitStack, settings: Settings, dashboard: Dashboard
-) -> FilePath:
-    """Return the folder of a run; if it has no result files, a table (trees.csv) of its trees without those
-    that were rejected in the review. Errors as in `_run_folder`, except NoFilesError.
-
-    Args:
-        key, settings, dashboard: See `_run_folder`.
-        run: The run with its map.
-        stack: Removes temporary files.
-    """
-    try:
-        return (await stack.enter_async_context(_run_folder(key, settings, dashboard)))[0]
-    except NoFilesError:
-        folder = FilePath(stack.enter_context(TemporaryDirectory(prefix="stemmap-run-")))
-        names = ("number", "x", "y", "dbh_cm")
-        trees = [tree for tree in run["map"]["trees"] if tree.get("review") != REJECTED]
-        cells = [[str(tree[n]) if tree[n] is not None else "" for n in names] for tree in trees]
-        write_texts(folder, {"trees.csv": csv_text(("tree", "x_m", "y_m", "dbh_cm"), cells)})
-        return folder / "trees.csv"
+        yield reviewed
 
 
 def _number(key: str) -> int:
@@ -297,7 +199,7 @@ async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], 
     return json_reply({"id": number})
 
 
-async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
+async def whole_run(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
     """Return a run as a dict of JSON values: the keys of `_row` for a record, or of
     `app.sources.inspection_process.finished` for a folder, with `key`, `map`, `revisions` (list of
     `_revision`; [] for a folder) and `differences`, see `_differences`.
@@ -314,7 +216,7 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
     if key.startswith(_FOLDER):
         name = key.removeprefix(_FOLDER)
         folder = await asyncio.to_thread(_finished_folder, name, settings)
-        async with _with_edits(folder, dashboard) as (reviewed, _):
+        async with _with_reviews(folder, dashboard) as reviewed:
             found = await opening.ask({"ask": "finished", "path": str(reviewed)})
         run = {"key": key, "name": name, "revisions": [], **found}
     else:
@@ -322,26 +224,6 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
         row = await dashboard.reviewed_runs.whole(number)
         run = {**_row(row), "map": row["map"], "revisions": [_revision(each) for each in row["revisions"]]}
     return {**run, "differences": _differences(run["preset"], run["parameters"])}
-
-
-def _changed_parameters(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a list of a dict for each parameter that differs, with `name` and the values `a` and `b`; None
-    in place of a value that a run does not have and of NaN and infinity.
-
-    Args:
-        a, b: Dicts from dotted names to values.
-    """
-    names = dict.fromkeys([*a, *b])
-    return [
-        {"name": name, "a": _plain(a.get(name)), "b": _plain(b.get(name))}
-        for name in names
-        if a.get(name) != b.get(name)
-    ]
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401 - whatever a parameter is
-    """Return a value for JSON: None for NaN and infinity, all else unchanged."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _differences(name: str, parameters: dict[str, Any]) -> dict[str, Any]:

@@ -137,11 +137,11 @@ export const redo = () => turn("/redo", "Redone");
 
 const edited = () => ({
   annotation: [...rows(), ...skips()],
-  plot: state.annotations?.plots ?? [],
-  "coordinate system": [state.annotations?.georeference].filter(Boolean),
+  ...state.annotations?.others,
+  "coordinate system": [state.annotations?.frame].filter(Boolean),
 });
 
-// Annotations and plots have one history: tells what the step changed, and selects the tree of a single annotation.
+// All classes of annotations have one history: tells what the step changed, and selects the tree of a single annotation.
 async function turn(where, word) {
   await settle();
   draft.answer = null;
@@ -152,7 +152,7 @@ async function turn(where, word) {
   });
   if (!done || run !== state.annotations?.run) return;
   const after = edited();
-  const parts = Object.keys(after).map((name) => [name, differing(before[name], after[name])]).filter(([, changes]) => changes.length);
+  const parts = Object.keys({ ...after, ...before }).map((name) => [name, differing(before[name] ?? [], after[name] ?? [])]).filter(([, changes]) => changes.length);
   showNews(`${word}: ${parts.map(([name, changes]) => count(changes.length, name)).join(", ") || "nothing changed"}.`);
   const [[name, [row, ...others]] = ["", []]] = parts;
   if (name !== "annotation" || others.length) return;

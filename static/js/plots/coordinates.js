@@ -19,7 +19,7 @@ let points = []; // {name, tree, x, y, east, north, z}: the place of a tree is t
 let shown = ""; // what was loaded of the stored reference system
 let dirty = false; // whether the fields differ from the stored ones
 
-const stored = () => state.annotations?.georeference ?? null;
+const stored = () => state.annotations?.frame ?? null;
 const how = () => byId("coordinates-how").value;
 
 // The control points that the map shows.

@@ -8,7 +8,7 @@ import { visible } from "../shell/tabs.js";
 export const SHAPES = { circle: "Circle", rectangle: "Rectangle", polygon: "Polygon" };
 const CLOSING = 10; // [px] around the first corner, where a click closes a polygon
 
-export const plots = () => state.annotations?.plots ?? [];
+export const plots = () => state.annotations?.others.plot ?? [];
 export const plotting = () => visible("plots");
 
 export const sketch = {

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.config import Parameters
 from pipeline.io.result_files import RunFiles, csv_text, seen_text
-from pipeline.stand.seen_area import CELL, SeenArea
+from pipeline.seen_area import CELL, SeenArea
 from pipeline.types.records import Path, Trees
 
 TERRAIN = ("x_m", "y_m", "z_m", "sigma_m", "views")

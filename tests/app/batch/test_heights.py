@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from app.batch.georeference import heights_at
+from app.batch.map_frame import heights_at
 
 
 @pytest.mark.parametrize("scattered", [False, True])

@@ -10,7 +10,7 @@ import pytest
 
 from app.batch.run_edits import SAME_THING, reviewed_run, reviews_of
 from app.batch.run_folder import read_run, read_terrain
-from app.store.records import PLOT, SKIPPED, Author, Content
+from app.store.records import SKIPPED, Author, Content
 from app.store.store import Store
 from pipeline.errors import SourceError
 from tests.app.batch.finished_runs import grid_run
@@ -26,7 +26,7 @@ PLACES = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
         ([Content(0.1, 0.0)], {1: "confirmed"}),
         ([Content(2.0, 0.2, "pole")], {2: "rejected"}),
         ([Content(0.0, SAME_THING + 0.01)], {}),  # a missed tree that was added
-        ([Content(0.0, 0.0, SKIPPED), Content(2.0, 0.0, PLOT)], {1: "skipped"}),
+        ([Content(0.0, 0.0, SKIPPED), Content(2.0, 0.0, "of others")], {1: "skipped"}),
         ([Content(0.0, 0.2, "pole"), Content(0.0, 0.0, SKIPPED)], {1: "rejected"}),
         ([Content(4.0, 0.1, "bush"), Content(4.0, 0.3), Content(0.0, 0.0)], {1: "confirmed", 3: "rejected"}),
         ([Content(4.0, 0.3), Content(4.0, 0.1, "bush")], {3: "rejected"}),

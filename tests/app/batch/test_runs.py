@@ -424,7 +424,8 @@ def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:
 
 async def test_the_report_of_a_run_is_that_of_the_command_line(both: Running, tmp_path: Path) -> None:
     """Of the open run, and of a run in the list, which keeps its result files."""
-    from app.batch.report import report_page
+    from app.extensions.stand.plot_files import plots_of_run
+    from app.extensions.stand.report import report_page
 
     client, dashboard = both
     assert (await client.get("/api/runs/open/report/html")).status_code == 409
@@ -448,7 +449,7 @@ async def test_the_report_of_a_run_is_that_of_the_command_line(both: Running, tm
     english = (await client.get("/api/runs/open/report/html")).text
     assert "What was left out" not in english  # only `stemmap map` counts it
     with ShownRun.of(dashboard).folder() as folder:
-        assert english == report_page(folder, plots=ShownRun.of(dashboard).sample_plots())
+        assert english == report_page(folder, plots=plots_of_run(ShownRun.of(dashboard)))
 
     key = next(row["key"] for row in await runs(client))
     assert (await client.get(f"/api/runs/{key}/report/html")).text == english

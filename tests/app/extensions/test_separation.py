@@ -27,6 +27,7 @@ WORDS = {
     "fleet": r"fleet|robots-link|common.map",
     "formats": r"victoria",
     "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
+    "stand": r"stand_figures",
     "learning": r"learning|\blearn-|stemmap train\b|\"train\"|Learn:",
 }
 NAMES = sorted(WORDS)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.batch.report import report_page
 from app.cli import main
 from app.dashboard.shown_run import ShownRun
+from app.extensions.stand.report import report_page
 from app.sources.request import SourceRequest
 from app.worker.process import new_session
 from app.worker.protocol import Open, Shown
@@ -20,7 +20,7 @@ from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import seen_text
-from pipeline.stand.seen_area import SeenRecorder
+from pipeline.seen_area import SeenRecorder
 from pipeline.types.records import Float, Frame, Path
 
 URI = "sim:stand?duration=7"

@@ -84,11 +84,11 @@ def _table(title: str, uri: str, *, errors_asked: bool) -> Table:
 def figures_and_truth(uri: str) -> tuple[dict[str, tuple[float, float]], dict[str, float], float]:
     """Map a run; the figures of the plot, their truth by "n" and "g", and the observed share of the plot."""
     from app.batch.run_folder import read_run
-    from app.batch.stand import stand_of
     from app.cli import main
-    from pipeline.config.stages import Stand
+    from app.extensions.stand.parameters import Stand
+    from app.extensions.stand.plots import circle
+    from app.extensions.stand.run_figures import stand_of
     from pipeline.io.readers import open_source
-    from pipeline.stand.plots import circle
 
     true_map = open_source(uri).truth()
     assert true_map is not None

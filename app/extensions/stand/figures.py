@@ -1,0 +1,369 @@
+"""Stand figures of one plot with standard errors, and of several plots together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from app.extensions.stand.parameters import Stand
+from pipeline.geometry.poses import Float
+from pipeline.types.records import Bool
+
+FEW_TREES = 10
+HECTARE = 1e4  # m^2
+REINEKE = 1.605
+INCH_10 = 25.4  # cm
+
+
+class Estimate(NamedTuple):
+    """A stand parameter with its standard error; NaN where unknown."""
+
+    value: float = math.nan
+    se: float = math.nan
+
+
+class DiameterClass(NamedTuple):
+    """One class of diameters: limits [cm], number of trees, stems [1/ha] and basal area [m^2/ha]."""
+
+    low: float
+    high: float
+    trees: int
+    n_ha: Estimate
+    g_ha: Estimate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlotTrees:
+    """The trees of a plot; columns of length T.
+
+    Attributes:
+        position: Positions x, y in the map, shape (T, 2) [m].
+        dbh, dbh_sigma: Diameters at breast height and their standard deviations [m]; NaN where unknown.
+        volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None if there is no volume
+            formula.
+    """
+
+    position: Float
+    dbh: Float
+    dbh_sigma: Float
+    volume: Float | None = None
+    volume_sigma: Float | None = None
+
+    def where(self, keep: Bool) -> PlotTrees:
+        """Return the rows for which `keep`, shape (T,), is true."""
+        volume, sigma = (None if c is None else c[keep] for c in (self.volume, self.volume_sigma))
+        return PlotTrees(self.position[keep], self.dbh[keep], self.dbh_sigma[keep], volume, sigma)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandFigures:
+    """Stand parameters of a plot.
+
+    Attributes:
+        area, seen: Area of the plot and its observed part [m^2].
+        trees: Number of trees of at least the minimum diameter in the observed part.
+        without_dbh: Number of these trees without a diameter; they count with the mean basal area of the
+            others.
+        with_volume: Number of these trees with a volume; None if there is no volume formula.
+        detection: Mean probability that a tree in the observed part is found.
+        values: Dict from the names in FIGURES, which has their units, to estimates. Names that end in
+            `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
+            probability of detection; the others refer to the observed area.
+        classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area. Empty, and
+            `trees` and `without_dbh` 0, if nothing was observed.
+        warnings: Messages for the user.
+    """
+
+    area: float
+    seen: float
+    trees: int
+    without_dbh: int
+    with_volume: int | None
+    detection: Estimate
+    values: Mapping[str, Estimate]
+    classes: tuple[DiameterClass, ...] = ()
+    warnings: tuple[str, ...] = field(default=())
+
+
+#: Title and unit of each figure.
+FIGURES = {
+    "n_ha": ("Stems per hectare", "1/ha"),
+    "n_ha_plain": ("Stems per hectare of the whole area", "1/ha"),
+    "n_ha_corrected": ("Stems per hectare, corrected for detection", "1/ha"),
+    "g_ha": ("Basal area", "m2/ha"),
+    "g_ha_plain": ("Basal area on the whole area", "m2/ha"),
+    "g_ha_corrected": ("Basal area, corrected for detection", "m2/ha"),
+    "v_ha": ("Stem volume", "m3/ha"),
+    "v_ha_corrected": ("Stem volume, corrected for detection", "m3/ha"),
+    "dg_cm": ("Quadratic mean diameter", "cm"),
+    "mean_dbh_cm": ("Mean diameter", "cm"),
+    "dominant_dbh_cm": ("Dominant diameter (100 thickest per hectare)", "cm"),
+    "sdi": ("Stand density index (Reineke)", "1/ha"),
+    "nearest_neighbour_m": ("Distance to the nearest neighbour", "m"),
+    "clark_evans": ("Clark-Evans index", ""),
+}
+
+
+def stand_figures(
+    trees: PlotTrees,
+    outside: PlotTrees,
+    *,
+    area: float,
+    seen: float,
+    perimeter: float,
+    detection: tuple[float, float],
+    parameters: Stand,
+) -> StandFigures:
+    """Return the stand parameters of a plot.
+
+    Standard errors are those of this plot, not of the stand around it: they contain the errors of the
+    diameters, the trees of the part that was not observed, and the trees that were not detected. A plot that
+    is observed completely, with certain detection and exact diameters of all trees, has standard errors of 0,
+    except for the parameters of the spatial pattern.
+
+    Args:
+        trees: Trees in the observed part, of any diameter.
+        outside: Trees in the rest of the plot, which count only in the `_plain` values.
+        area: Area of the plot [m^2].
+        seen: Area of the observed part of the plot [m^2].
+        perimeter: Length of the border of the observed part [m], for the edge correction of the Clark-Evans
+            index.
+        detection: Mean probability of detection in the observed part and its standard error; NaN if unknown.
+        parameters: Limits of diameters and classes.
+
+    Returns:
+        The stand parameters. Trees thinner than the minimum diameter do not count; those without a diameter
+        do. Unknown parameters are NaN: all but the `_plain` ones if no area was observed; the corrected ones
+        if the probability is NaN or not above 0; basal areas and volumes if there are trees, but none has a
+        diameter or a volume; volumes without a formula; figures of diameters if no tree has a diameter; and
+        those of the pattern for fewer than two trees. `_plain` figures have no standard error. In `v_ha`,
+        trees without a volume count as 0.
+
+    Raises:
+        ValueError: The plot has no area.
+    """
+    warnings = []
+    counted = ~(trees.dbh < parameters.dbh_min)  # trees without a diameter count
+    kept = trees.where(counted)
+    n, missing = len(kept.dbh), int(np.count_nonzero(np.isnan(kept.dbh)))
+    if area <= 0.0:
+        raise ValueError("a plot has no area")
+    if seen <= 0.0:
+        warnings.append("no part of the plot was observed: no figures")
+    elif n == 0:
+        warnings.append("the plot has no trees")
+    elif n < FEW_TREES:
+        warnings.append(f"only {n} {'tree' if n == 1 else 'trees'}: the figures are uncertain")
+    if missing:
+        warnings.append(f"{missing} of {n} trees have no diameter; they count with the mean basal area")
+    volumes = None if kept.volume is None else int(np.count_nonzero(np.isfinite(kept.volume)))
+    if volumes is not None and volumes < n:
+        warnings.append(
+            f"volume of {volumes} of {n} trees: the others have no height, no diameter or a negative volume"
+        )
+    if 0.0 < seen < 0.5 * area:
+        warnings.append(f"only {100.0 * seen / area:.0f} % of the plot was observed")
+    p, p_se = detection
+    values = dict.fromkeys(FIGURES, Estimate())
+    every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
+    plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))))
+    values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)
+    values["g_ha_plain"] = Estimate(HECTARE * float(plain.sum()) / area)
+    if seen <= 0.0:
+        return StandFigures(area, 0.0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
+    share = min(seen / area, 1.0)
+    basal, basal_var = _basal_areas(kept)
+    unsure = _threshold_variance(trees, parameters.dbh_min)
+    totals = [
+        ("n_ha", np.ones(n), unsure),
+        ("g_ha", basal, float(basal_var.sum()) + unsure * _least_basal(parameters) ** 2),
+    ]
+    if kept.volume is not None and kept.volume_sigma is not None and (volumes or not n):
+        variance = float(np.square(np.nan_to_num(kept.volume_sigma)).sum())
+        totals.append(("v_ha", np.nan_to_num(kept.volume), variance))
+    for name, weights, variance in totals:
+        total, squares = float(weights.sum()), float(np.square(weights).sum())
+        se = math.sqrt((1.0 - share) * squares + variance)
+        values[name] = Estimate(HECTARE * total / seen, HECTARE * se / seen)
+        if p > 0.0:
+            spread = (1.0 - share * p) * squares + variance + (total * p_se / p) ** 2
+            scale = HECTARE / (seen * p)
+            values[f"{name}_corrected"] = Estimate(scale * total, scale * math.sqrt(spread))
+    found = share * (p if p > 0.0 else 1.0)
+    values.update(_diameter_figures(kept, found, seen, parameters))
+    values.update(_pattern(kept.position, seen, perimeter))
+    classes = _classes(kept, share, seen, parameters)
+    return StandFigures(area, seen, n, missing, volumes, Estimate(p, p_se), values, classes, tuple(warnings))
+
+
+def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
+    """Return a dict from the names in FIGURES to means over plots, with the standard error of the variation
+    between plots (ratio estimator). The weights are the observed areas, for `_plain` names the whole areas.
+    The error is NaN for one plot. Plots in which a value is NaN do not count; if all are NaN, so is the
+    mean."""
+    result = {}
+    for name in FIGURES:
+        rows = [
+            (f.area if name.endswith("_plain") else f.seen, f.values[name].value)
+            for f in plots.values()
+            if math.isfinite(f.values[name].value)
+        ]
+        if not rows:
+            result[name] = Estimate()
+            continue
+        weight, value = np.array(rows).T
+        share = weight / weight.sum()
+        mean, k = float(share @ value), len(rows)
+        se = math.sqrt(k / (k - 1) * float(np.square(share * (value - mean)).sum())) if k > 1 else math.nan
+        result[name] = Estimate(mean, se)
+    return result
+
+
+def _least_basal(parameters: Stand) -> float:
+    return 0.25 * math.pi * parameters.dbh_min**2
+
+
+def _basal_areas(trees: PlotTrees) -> tuple[Float, Float]:
+    """Return the basal area of each tree [m^2] and its variance [m^4], shape (T,) each. A tree without a
+    diameter has the mean, and the variance among the others (of a single one its square); all are NaN if no
+    tree has a diameter. An unknown standard deviation of a diameter counts as 0."""
+    d, sigma = trees.dbh, np.nan_to_num(trees.dbh_sigma)
+    known = np.isfinite(d)
+    basal = 0.25 * math.pi * np.square(d)
+    variance = np.square(0.5 * math.pi * d * sigma)
+    if not known.all():
+        mean = float(basal[known].mean()) if known.any() else math.nan
+        spread = float(basal[known].var(ddof=1)) if known.sum() > 1 else mean**2
+        basal, variance = np.where(known, basal, mean), np.where(known, variance, spread)
+    return basal, variance
+
+
+def _threshold_variance(trees: PlotTrees, least: float) -> float:
+    """Return the variance of the number of trees above the diameter `least` [m] by the errors of diameters;
+    trees without a diameter or its standard deviation add nothing."""
+    from scipy.special import ndtr
+
+    sigma = np.where(trees.dbh_sigma > 0.0, trees.dbh_sigma, np.nan)
+    p = ndtr((trees.dbh - least) / sigma)
+    return float(np.nansum(p * (1.0 - p)))
+
+
+def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: Stand) -> dict[str, Estimate]:
+    """Return a dict from "dg_cm", "mean_dbh_cm", "dominant_dbh_cm" and "sdi" to estimates; empty if no tree
+    has a diameter. The standard errors contain the jackknife over trees, reduced by the share `found` of all
+    trees, and the errors of the diameters. `seen` is the observed area [m^2]."""
+    known = np.isfinite(trees.dbh)
+    d, sigma = 100.0 * trees.dbh[known], 100.0 * np.nan_to_num(trees.dbh_sigma[known])
+    if not len(d):
+        return {}
+    thickest = min(parameters.dominant_per_ha * seen / HECTARE, float(len(d)))
+    stems = HECTARE * len(trees.dbh) / seen
+
+    def dominant(values: Float) -> tuple[float, Float]:
+        order = np.argsort(-values, kind="stable")
+        weight = np.zeros(len(values))
+        weight[order] = np.clip(min(thickest, len(values)) - np.arange(len(values)), 0.0, 1.0)
+        weight /= weight.sum()
+        figure = math.sqrt(float(weight @ np.square(values)))
+        return figure, weight * values / figure
+
+    def quadratic(values: Float) -> tuple[float, Float]:
+        figure = math.sqrt(float(np.square(values).mean()))
+        return figure, values / (len(values) * figure)
+
+    def mean(values: Float) -> tuple[float, Float]:
+        return float(values.mean()), np.full(len(values), 1.0 / len(values))
+
+    def density(values: Float) -> tuple[float, Float]:
+        dg, slope = quadratic(values)
+        figure = float(stems * len(values) / len(d) * (dg / INCH_10) ** REINEKE)
+        return figure, REINEKE * figure / dg * slope
+
+    figures = {"dg_cm": quadratic, "mean_dbh_cm": mean, "dominant_dbh_cm": dominant, "sdi": density}
+    return {name: _with_error(figure, d, sigma, found) for name, figure in figures.items()}
+
+
+def _with_error(
+    figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, found: float
+) -> Estimate:
+    """Return a stand parameter with its standard error, which is NaN for a single tree of an incomplete plot.
+
+    Args:
+        figure: Function of the diameters, shape (N,) [cm], that returns the stand parameter and its
+            derivatives with respect to the diameters, shape (N,).
+        d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
+        found: Share of all trees that was found and observed.
+    """
+    n = len(d)
+    value, slope = figure(d)
+    measured = float(np.square(slope * sigma).sum())
+    sampled = 0.0
+    if n > 1 and found < 1.0:
+        without = np.array([figure(np.delete(d, k))[0] for k in range(n)])
+        sampled = (1.0 - found) * (n - 1) / n * float(np.square(without - without.mean()).sum())
+    return Estimate(value, math.sqrt(measured + sampled) if n > 1 or found >= 1.0 else math.nan)
+
+
+def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estimate]:
+    """Return a dict from names to estimates: "nearest_neighbour_m", the mean distance to the nearest
+    neighbour [m], and "clark_evans", the index with the edge correction of Donnelly (1978): 1 for random
+    positions, less for clusters, more for regular ones. The error of the index is that of random positions.
+    Empty for fewer than two trees.
+
+    Args:
+        position: Positions of the trees, shape (N, 2) [m].
+        area, perimeter: Observed area [m^2] and the length of its border [m].
+    """
+    from scipy.spatial import cKDTree
+
+    n = len(position)
+    if n < 2:
+        return {}
+    nearest = cKDTree(position).query(position, k=2)[0][:, 1]
+    mean = float(nearest.mean())
+    expected = 0.5 * math.sqrt(area / n) + (0.0514 + 0.041 / math.sqrt(n)) * perimeter / n
+    spread = math.sqrt(0.0703 * area / n**2 + 0.037 * perimeter * math.sqrt(area / n**5))
+    return {
+        "nearest_neighbour_m": Estimate(mean, float(nearest.std(ddof=1)) / math.sqrt(n)),
+        "clark_evans": Estimate(mean / expected, spread / expected),
+    }
+
+
+def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> tuple[DiameterClass, ...]:
+    """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
+    included; none if no tree has a diameter. The first class begins at the minimum diameter, which makes it
+    narrower unless that is a multiple of the width. Trees without a diameter are left out; thinner ones than
+    the minimum count in the first class.
+
+    Args:
+        trees: Trees of the observed part.
+        share: Share of the plot that was observed.
+        seen: Observed area [m^2].
+        parameters: Minimum diameter and width of a class.
+    """
+    known = trees.where(np.isfinite(trees.dbh))
+    if not len(known.dbh):
+        return ()
+    width = parameters.class_width
+    first = math.floor(parameters.dbh_min / width + 1e-9)
+    of = np.maximum(np.floor(known.dbh / width + 1e-9).astype(int), first)
+    scale, rest = HECTARE / seen, 1.0 - share
+    rows = []
+    for k in range(first, int(of.max()) + 1):
+        basal, variance = _basal_areas(known.where(of == k))
+        n = len(basal)
+        g_se = math.sqrt(rest * float(np.square(basal).sum()) + float(variance.sum()))
+        rows.append(
+            DiameterClass(
+                round(100.0 * max(k * width, parameters.dbh_min), 6),
+                round(100.0 * (k + 1) * width, 6),
+                n,
+                Estimate(scale * n, scale * math.sqrt(rest * n)),
+                Estimate(scale * float(basal.sum()), scale * g_se),
+            )
+        )
+    return tuple(rows)

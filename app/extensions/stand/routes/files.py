@@ -1,0 +1,103 @@
+"""Files of a run with its plots: for GIS, CAD and spreadsheets, and the report."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
+from typing import Literal
+
+from fastapi import APIRouter
+from shapely.geometry import mapping
+from starlette.responses import Response
+
+from app.batch.run_folder import read_run_record
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.shown_run import ShownRun
+from app.extensions.stand.parameters import Stand
+from app.extensions.stand.plot_files import plots_of_run, stored_plots
+from app.extensions.stand.plots import SamplePlot
+from app.extensions.stand.questions import REPORT
+from app.extensions.stand.routes.figure_parameters import FigureParameters
+from app.sources import opening
+from app.web.responses import as_bad_request, bytes_reply
+from app.web.routes.access import Dash, Deployment, ViewerTurn
+from app.web.routes.runs import Key, is_open_run, run_folder
+
+router = APIRouter(prefix="/api")
+
+# A PDF of a large stand on a busy machine.
+_REPORT_S = 240.0
+
+
+async def _export(suffix: str, dashboard: Dashboard, parameters: Stand) -> Response:
+    """Return the map with the plots of the run as a file, in the reference system of the map. For a run of
+    scans, the bytes are those of `stemmap export` for a run with the same map and plots. 409 before the first
+    map; 422 if a package is missing, the map lacks what the format shows, or all plots are outside of what
+    was observed."""
+    run = ShownRun.of(dashboard)
+    with as_bad_request():
+        content, name = await asyncio.to_thread(_exported, run, f".{suffix}", parameters)
+    return bytes_reply(content, filename=name)
+
+
+def _exported(run: ShownRun, suffix: str, parameters: Stand) -> tuple[bytes, str]:
+    """Return the bytes and the name of the exported file for a suffix with its dot, for example ".gpkg";
+    StemmapError where `_export` answers 422."""
+    from app.batch.export import export_bytes
+    from app.extensions.stand.gis_files import WRITERS, read_with_plots
+    from app.extensions.stand.run_figures import stand_of
+
+    plots = plots_of_run(run)
+    with run.folder() as folder:
+        of_plots = stand_of(folder, parameters, plots) if plots else None
+        return export_bytes(read_with_plots(folder, of_plots), suffix, WRITERS)
+
+
+def _add_export(suffix: str) -> None:
+    """Add the route of a format."""
+
+    @router.get(f"/export/{suffix}", dependencies=[ViewerTurn], name=f"export_{suffix}")
+    async def export(dashboard: Dash, parameters: FigureParameters) -> Response:
+        return await _export(suffix, dashboard, parameters)
+
+
+# The GeoPackage has plots, in place of that of the program.
+for _suffix in ("gpkg", "shp", "dxf", "xlsx", "tif"):
+    _add_export(_suffix)
+
+
+@router.get("/runs/{key}/report/{suffix}", dependencies=[ViewerTurn])
+async def report(
+    key: Key,
+    suffix: Literal["html", "pdf"],
+    dashboard: Dash,
+    settings: Deployment,
+    parameters: FigureParameters,
+    language: Literal["en", "de"] = "en",
+) -> Response:
+    """Return the report of `stemmap report` for a run with its plots; a child process writes it. The key is
+    the number of a record, "folder:NAME", or "open" for the open run. 404 for an unknown run, 409 if there is
+    no report of it, as no PDF without Chromium."""
+    async with run_folder(key, settings, dashboard) as folder:
+        plots = await _plots_of(key, folder, dashboard)
+        with TemporaryDirectory(prefix="stemmap-report-") as there:
+            file = FilePath(there) / f"report.{suffix}"
+            question = {
+                "ask": REPORT,
+                "path": str(folder),
+                "file": str(file),
+                "language": language,
+                "plots": [(plot.name, mapping(plot.shape)) for plot in plots],
+                "parameters": parameters.model_dump(),
+            }
+            await opening.ask(question, patience_s=_REPORT_S)
+            return bytes_reply(await asyncio.to_thread(file.read_bytes), filename=file.name)
+
+
+async def _plots_of(key: str, folder: FilePath, dashboard: Dashboard) -> list[SamplePlot]:
+    """Return the plots of a run by its key and its folder; StemmapError if the store cannot be used."""
+    if is_open_run(key, dashboard):
+        return plots_of_run(ShownRun.of(dashboard))
+    source = (await asyncio.to_thread(read_run_record, folder))["source"]
+    return await dashboard.store.ask(lambda store: stored_plots(store, source))

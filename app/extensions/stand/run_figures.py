@@ -1,0 +1,329 @@
+"""Stand figures of a finished run: reads its folder and plots, and writes tables."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.batch.map_frame import MapFrame, read_map_frame
+from app.batch.run_folder import FinishedRun, read_run, read_seen_area
+from app.common.text import count, version
+from app.extensions.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
+from app.extensions.stand.parameters import Stand
+from app.extensions.stand.plots import SamplePlot, detection_function, figures_of, seen_plot, within_reach
+from app.extensions.stand.volume import VolumeFormula
+from pipeline.errors import StemmapError
+from pipeline.io.result_files import csv_text, number_text
+from pipeline.seen_area import SeenArea
+from pipeline.types.records import Trees
+
+ALL = "all"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandResult:
+    """Stand parameters of a run.
+
+    Attributes:
+        run, frame: The run and the frame of its map.
+        trees: Trees of the run.
+        parameters: Parameters of the computation.
+        plots: The plots; if there are none, the whole observed area.
+        whole: Whether there are no plots, and the only one is the whole observed area.
+        seen: Observed area within reach.
+        figures: Dict from the name of each plot to its stand parameters.
+        total: Dict from each stand parameter to its mean over the plots; with one plot, that of the plot.
+        left_out: Dict from the reason to the number of trees of the map that no plot counts for it:
+            `rejected` (in the review), `outside_of_plots` (only with plots), `outside_of_observed_area` or
+            `below_minimum_dbh`, whichever comes first. A tree without a diameter is not below the minimum.
+        detection_sigma: Scale of the half-normal detection function [m]; inf if detection does not decrease
+            with distance.
+        warnings: Messages, those of plots with the name of the plot.
+    """
+
+    run: FinishedRun
+    frame: MapFrame
+    trees: PlotTrees
+    parameters: Stand
+    plots: Sequence[SamplePlot]
+    whole: bool
+    seen: SeenArea
+    figures: dict[str, StandFigures]
+    total: dict[str, Estimate]
+    left_out: dict[str, int]
+    detection_sigma: float
+    warnings: tuple[str, ...]
+
+
+def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = ()) -> StandResult:
+    """Return the stand parameters of a finished run; rejected trees do not count. Nothing is written.
+    Diameters that look like those of another unit, few trees, and overlapping plots are warnings.
+
+    Args:
+        folder: Folder of the run.
+        parameters: Parameters of the computation.
+        plots: Plots in the frame of the map; without any, the whole observed area is one plot.
+
+    Raises:
+        StemmapError: The folder is not that of a run, a file is damaged, the run has no seen.csv or observed
+            nothing within reach, two plots have the same name, no plot touches the observed area, or the
+            volume formula is not valid.
+    """
+    run, frame = read_run(folder), read_map_frame(folder)
+    warnings = []
+    recorded = read_seen_area(folder)
+    if recorded is None:
+        raise StemmapError(
+            "the run has no record of what was observed (seen.csv)", where=str(folder), remedy="Map it again"
+        )
+    seen = within_reach(recorded, parameters)
+    if not len(seen.place):
+        raise StemmapError(
+            "no area was observed within reach",
+            where=str(folder),
+            remedy="Map more of it, or allow a greater reach (--reach) or fewer views (--views-min)",
+        )
+    names = [plot.name for plot in plots]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise StemmapError(f"two plots are called {twice!r}", remedy="Give each plot its own name")
+    trees = _plot_trees(run.trees, parameters.volume)
+    chosen = list(plots) or [seen_plot(ALL, seen)]
+    figures = figures_of(chosen, trees, seen, parameters)
+    if not any(f.seen > 0.0 for f in figures.values()):
+        raise StemmapError(
+            f"{'the plot is' if len(chosen) == 1 else 'all plots are'} outside of what the run observed",
+            where=str(folder),
+            remedy=f"Check the coordinates; the map is in {frame.title} coordinates, "
+            f"{_extent(frame.to_crs(seen.centres))}",
+        )
+    for name, f in figures.items():
+        warnings += [f"plot {name}: {text}" if plots else text for text in f.warnings]
+    areas = [plot.shape for plot in chosen]
+    if shapely.union_all(areas).area < 0.999 * sum(shape.area for shape in areas):
+        warnings.append("plots overlap: what they share counts in each of them")
+    if len(chosen) > 1 and 0 < sum(f.trees for f in figures.values()) < FEW_TREES:
+        warnings.append("fewer than ten trees in all plots: the figures are uncertain")
+    if np.nanmax(trees.dbh, initial=0.0) > 3.0:
+        warnings.append("a diameter is larger than 3 m: is the column dbh_cm of trees.csv in centimetres?")
+    elif np.isfinite(trees.dbh).sum() >= 3 and np.nanmax(trees.dbh) < 0.02:
+        warnings.append("all diameters are below 2 cm: is the column dbh_cm of trees.csv in metres?")
+    total = combined(figures) if len(chosen) > 1 else dict(figures[chosen[0].name].values)
+    sigma = detection_function(trees, seen, parameters).sigma
+    left_out = {"rejected": run.rejected, **_left_out(trees, plots, seen, parameters.dbh_min)}
+    return StandResult(
+        run,
+        frame,
+        trees,
+        parameters,
+        chosen,
+        not plots,
+        seen,
+        figures,
+        total,
+        left_out,
+        sigma,
+        tuple(warnings),
+    )
+
+
+def _left_out(
+    trees: PlotTrees, plots: Sequence[SamplePlot], seen: SeenArea, dbh_min: float
+) -> dict[str, int]:
+    """Return a dict from each reason of `StandResult.left_out` except `rejected` to the number of trees that
+    no plot counts for it, each tree for the first reason only; without `outside_of_plots` if there are no
+    plots."""
+    reasons = {
+        "outside_of_observed_area": seen.rows(trees.position) < 0,
+        "below_minimum_dbh": trees.dbh < dbh_min,
+    }
+    if plots:
+        inside = np.any([plot.contains(trees.position) for plot in plots], axis=0)
+        reasons = {"outside_of_plots": ~inside, **reasons}
+    counted = np.ones(len(trees.dbh), np.bool_)
+    result = {}
+    for reason, applies in reasons.items():
+        result[reason] = int(np.count_nonzero(counted & applies))
+        counted &= ~applies
+    return result
+
+
+def _plot_trees(trees: Trees, formula: str) -> PlotTrees:
+    """Return trees for stand figures, with volumes by a formula if it is not empty; raises StemmapError if it
+    is not valid."""
+    if not formula:
+        return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma)
+    unknown = np.full(len(trees.number), np.nan)
+    height = unknown if trees.height is None else trees.height
+    sigma = unknown if trees.height_sigma is None else trees.height_sigma
+    volume = VolumeFormula.parse(formula).with_sigma(trees.dbh, trees.dbh_sigma, height, sigma)
+    return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, *volume)
+
+
+def _extent(points: np.ndarray) -> str:
+    """Return the bounding box of points, shape (N, 2) [m], as text; N is at least 1."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return f"x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} to {high[1]:.0f} m"
+
+
+PLOT_COLUMNS = (
+    "plot",
+    "area_m2",
+    "seen_m2",
+    "trees",
+    "trees_without_dbh",
+    "trees_with_volume",
+    "detection",
+    "detection_se",
+)
+CLASS_COLUMNS = ("plot", "from_cm", "to_cm", "trees", "n_ha", "n_ha_se", "g_ha", "g_ha_se")
+
+
+def stand_files(result: StandResult) -> dict[str, str]:
+    """Return a dict from the names of three files to their texts. stand.csv has the columns PLOT_COLUMNS,
+    then each stand parameter of FIGURES and its standard error with "_se", one row per plot, and for several
+    plots a row `mean` with only stand parameters. classes.csv has the columns CLASS_COLUMNS, one row per plot
+    and class. stand.json is `stand_record`. Unknown values are empty cells or null."""
+    header = (*PLOT_COLUMNS, *(f"{name}{end}" for name in FIGURES for end in ("", "_se")))
+    rows = []
+    for name, f in result.figures.items():
+        about = [name, f"{f.area:.2f}", f"{f.seen:.2f}", str(f.trees), str(f.without_dbh)]
+        about.append("" if f.with_volume is None else str(f.with_volume))
+        rows.append([*about, *_numbers(f.detection), *_cells(dict(f.values))])
+    if len(result.figures) > 1:
+        rows.append(["mean", *[""] * (len(PLOT_COLUMNS) - 1), *_cells(result.total)])
+    classes = [
+        [name, f"{c.low:g}", f"{c.high:g}", str(c.trees), *_numbers((*c.n_ha, *c.g_ha))]
+        for name, f in result.figures.items()
+        for c in f.classes
+    ]
+    return {
+        "stand.csv": csv_text(header, rows),
+        "classes.csv": csv_text(CLASS_COLUMNS, classes),
+        "stand.json": json.dumps(stand_record(result), indent=1, allow_nan=False) + "\n",
+    }
+
+
+def stand_record(result: StandResult) -> dict[str, Any]:
+    """Return the content of stand.json, a dict of JSON values.
+
+    Each parameter of the stand is a list [value, standard error], in which an unknown number is None. The
+    keys are:
+
+    - `stemmap`: version; `source`: URI of the run; `crs`: name of the frame; `warnings`: list of strings;
+    - `parameters`: dict of the parameters of `Stand`;
+    - `trees_in_map`: number of trees, with rejected ones; `trees_left_out`: dict from a reason to the number
+    of trees that no plot counts;
+    - `detection_sigma_m`: None if all trees are assumed to be detected;
+    - `units`: dict from each stand parameter to its unit;
+    - `plots`: dict from the name of each plot to a dict with `area_m2`, `seen_m2`, `trees`,
+    `trees_without_dbh`, `trees_with_volume` (None if unknown), `detection` (a stand parameter), the other
+    stand parameters by name, and `classes`, a list of dicts with `from_cm`, `to_cm`, `trees`, `n_ha` and
+    `g_ha`;
+    - `mean`: dict from each stand parameter to its mean over all plots.
+    """
+    return {
+        "stemmap": version(),
+        "source": result.run.uri,
+        "crs": result.frame.name,
+        "parameters": result.parameters.model_dump(),
+        "trees_in_map": len(result.trees.dbh) + result.run.rejected,
+        "trees_left_out": result.left_out,
+        "detection_sigma_m": _finite(result.detection_sigma),
+        "units": {name: unit for name, (_, unit) in FIGURES.items()},
+        "plots": {
+            name: {
+                "area_m2": round(f.area, 3),
+                "seen_m2": round(f.seen, 3),
+                "trees": f.trees,
+                "trees_without_dbh": f.without_dbh,
+                "trees_with_volume": f.with_volume,
+                "detection": _pair(f.detection),
+                **{key: _pair(value) for key, value in f.values.items()},
+                "classes": [
+                    {
+                        "from_cm": c.low,
+                        "to_cm": c.high,
+                        "trees": c.trees,
+                        "n_ha": _pair(c.n_ha),
+                        "g_ha": _pair(c.g_ha),
+                    }
+                    for c in f.classes
+                ],
+            }
+            for name, f in result.figures.items()
+        },
+        "mean": {key: _pair(value) for key, value in result.total.items()},
+        "warnings": list(result.warnings),
+    }
+
+
+def _pair(estimate: Estimate) -> list[float | None]:
+    """Return [value, standard error] of an estimate, rounded to six decimals; None in place of a number that
+    is not finite."""
+    return [_finite(value) for value in estimate]
+
+
+def _finite(value: float) -> float | None:
+    """Return a number rounded to six decimals; None if it is not finite."""
+    return round(float(value), 6) if math.isfinite(value) else None
+
+
+def _cells(values: dict[str, Estimate]) -> list[str]:
+    """Return value and standard error of each stand parameter as cells, in the order of FIGURES, see
+    `_numbers`."""
+    return _numbers([value for name in FIGURES for value in values[name]])
+
+
+def _numbers(values: Sequence[float]) -> list[str]:
+    """Return each number as text with four decimals; "" if it is not finite."""
+    return [number_text(value, 4) for value in values]
+
+
+def stand_summary(result: StandResult) -> list[str]:
+    """Return the stand parameters over all plots as lines for people: the number of trees and the area, trees
+    that are not counted if there are any, the stand parameters that have a value, detection, and the meaning
+    of the standard errors. Warnings are not included."""
+    seen = sum(f.seen for f in result.figures.values())
+    area = sum(f.area for f in result.figures.values())
+    trees = sum(f.trees for f in result.figures.values())
+    of = "whole observed area" if result.whole else count(len(result.figures), "plot")
+    least = f"{100.0 * result.parameters.dbh_min:g} cm"
+    part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
+    left_out = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in result.left_out.items() if n)
+    lines = [
+        f"{of}: {count(trees, 'tree')} from {least} on {seen:,.0f} m2 observed{part}, "
+        f"coordinates {result.frame.title}"
+    ]
+    if left_out:
+        lines.append(f"trees of the map that are not counted: {left_out}")
+    for name, (title, unit) in FIGURES.items():
+        value, se = result.total[name]
+        if math.isfinite(value):
+            error = f" +- {_digits(se)}" if math.isfinite(se) else ""
+            lines.append(f"{title}: {_digits(value)}{error} {unit}".rstrip())
+    sigma = result.detection_sigma
+    if math.isfinite(sigma):
+        lines.append(f"detection: half-normal over distance, sigma {sigma:.1f} m")
+        lines.append(
+            "which to use: the figures without correction; corrected ones only where trees far from the path "
+            "were missed, because they are too large where the stand is thinner there"
+        )
+    else:
+        lines.append("detection: does not decrease with distance within reach")
+    errors = "between plots" if len(result.figures) > 1 else "of this area: diameters, occlusion, detection"
+    lines.append(f"+- standard error {errors}")
+    return lines
+
+
+def _digits(value: float) -> str:
+    """Return a number as text with two decimals if its absolute value is below 10, with one if it is below
+    100, else with none and a comma between thousands."""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"

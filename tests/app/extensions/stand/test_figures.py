@@ -1,0 +1,227 @@
+"""Stand figures against closed forms."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from app.extensions.stand.figures import PlotTrees, combined, stand_figures
+from app.extensions.stand.parameters import Stand
+
+
+def trees_of(dbh, sigma=0.0, position=None):
+    """Trees in a row, 2 m apart, unless positions are given."""
+    dbh = np.array(dbh, np.float64)
+    if position is None:
+        position = np.stack([2.0 * np.arange(len(dbh)), np.zeros(len(dbh))], axis=1)
+    return PlotTrees(np.reshape(position, (-1, 2)), dbh, np.full(len(dbh), sigma))
+
+
+def figures(
+    trees, *, area=1000.0, seen=None, outside=None, detection=(1.0, 0.0), perimeter=120.0, limits=None
+):
+    """Figures of a plot that was observed completely, unless something else is given."""
+    return stand_figures(
+        trees,
+        trees_of([]) if outside is None else outside,
+        area=area,
+        seen=area if seen is None else seen,
+        perimeter=perimeter,
+        detection=detection,
+        parameters=limits or Stand(),
+    )
+
+
+def test_a_complete_plot_with_exact_diameters_has_the_textbook_figures_without_error():
+    f = figures(trees_of([0.10, 0.20, 0.30, 0.40] * 5))
+    v = f.values
+    assert v["n_ha"] == (200.0, 0.0)
+    basal = math.pi / 4 * (0.01 + 0.04 + 0.09 + 0.16) * 5
+    assert v["g_ha"].value == pytest.approx(10.0 * basal)
+    dg = 100.0 * math.sqrt(0.30 / 4)
+    assert v["dg_cm"].value == pytest.approx(dg)
+    assert v["mean_dbh_cm"].value == pytest.approx(25.0)
+    # 100 per hectare are 10 trees here: five of 40 cm and five of 30 cm
+    assert v["dominant_dbh_cm"].value == pytest.approx(100.0 * math.sqrt((0.16 + 0.09) / 2))
+    assert v["sdi"].value == pytest.approx(200.0 * (dg / 25.4) ** 1.605)
+    assert [v[name].se for name in ("g_ha", "dg_cm", "mean_dbh_cm", "dominant_dbh_cm", "sdi")] == [0.0] * 5
+    assert f.warnings == ()
+
+
+def test_stems_of_25_4_cm_have_their_number_as_density_index():
+    assert figures(trees_of([0.254] * 30)).values["sdi"].value == pytest.approx(300.0)
+
+
+def test_errors_of_diameters_reach_the_figures_as_by_propagation():
+    d, sigma = np.array([0.15, 0.25, 0.35] * 4), 0.01
+    v = figures(trees_of(d, sigma)).values
+    assert v["g_ha"].se == pytest.approx(10.0 * math.sqrt(np.square(math.pi / 2 * d * sigma).sum()), rel=1e-4)
+    assert v["mean_dbh_cm"].se == pytest.approx(1.0 / math.sqrt(12), rel=1e-3)
+    dg = math.sqrt(np.square(d).mean())
+    assert v["dg_cm"].se == pytest.approx(100 * math.sqrt(np.square(d * sigma).sum()) / (12 * dg), rel=1e-3)
+    assert v["n_ha"].se == pytest.approx(0.0, abs=1e-5)
+
+
+def test_equal_diameters_do_not_inflate_the_error_of_the_dominant_one():
+    dominant = figures(trees_of([0.2] * 40, 0.01)).values["dominant_dbh_cm"]
+    assert dominant == pytest.approx((20.0, 1.0 / math.sqrt(10)))
+
+
+def test_the_unseen_part_of_a_plot_has_a_sampling_error_like_that_of_drawn_stands():
+    """Stands drawn at random, a quarter of the plot seen: the errors agree with the spread of the figures."""
+    random = np.random.default_rng(1)
+    errors, told = [], []
+    for _ in range(400):
+        d = random.uniform(0.1, 0.5, random.poisson(80))
+        seen = random.random(len(d)) < 0.25
+        v = figures(trees_of(d[seen]), seen=250.0, outside=trees_of(d[~seen])).values
+        truth = 10.0 * math.pi / 4 * float(np.square(d).sum())
+        assert v["n_ha_plain"].value == pytest.approx(10.0 * len(d))
+        errors.append((v["n_ha"].value - 10.0 * len(d), v["g_ha"].value - truth))
+        told.append((v["n_ha"].se, v["g_ha"].se))
+    ratio = np.std(errors, axis=0) / np.sqrt(np.mean(np.square(told), axis=0))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.12)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 3 * np.std(errors, axis=0) / 20)
+
+
+def test_trees_that_are_not_detected_are_added_with_their_error():
+    random = np.random.default_rng(2)
+    errors, told = [], []
+    for _ in range(400):
+        found = trees_of([0.2] * random.binomial(100, 0.7))
+        n = figures(found, detection=(0.7, 0.0)).values["n_ha_corrected"]
+        errors.append(n.value - 1000.0)
+        told.append(n.se)
+    assert abs(np.mean(errors)) < 3 * np.std(errors) / 20
+    assert np.std(errors) == pytest.approx(math.sqrt(np.mean(np.square(told))), rel=0.12)
+    sure, unsure = (figures(trees_of([0.2] * 70), detection=(0.7, e)) for e in (0.0, 0.07))
+    assert unsure.values["n_ha_corrected"].se > sure.values["n_ha_corrected"].se
+    assert unsure.values["n_ha"] == sure.values["n_ha"]
+
+
+def test_thin_trees_do_not_count_and_those_without_a_diameter_have_the_mean():
+    f = figures(trees_of([0.05, 0.2, 0.2, math.nan] * 3))
+    assert (f.trees, f.without_dbh) == (9, 3)
+    assert f.values["g_ha"].value == pytest.approx(10.0 * 9 * math.pi / 4 * 0.04)
+    assert f.values["n_ha"].value == pytest.approx(90.0)
+    assert any("3 of 9 trees have no diameter" in text for text in f.warnings)
+    assert figures(trees_of([0.05]), limits=Stand(dbh_min=0.04)).trees == 1
+
+
+def test_a_tree_near_the_minimum_diameter_makes_the_number_uncertain():
+    at_limit = figures(trees_of([0.07] + [0.3] * 11, 0.01)).values["n_ha"]
+    assert at_limit.se == pytest.approx(10.0 * 0.5, rel=1e-6)
+
+
+def test_classes_cover_all_trees_once():
+    f = figures(trees_of([0.07, 0.08, 0.12, 0.1199, 0.20, 0.31]))
+    assert [c[:2] for c in f.classes[:2]] == [(7.0, 8.0), (8.0, 12.0)]
+    assert [c.trees for c in f.classes] == [1, 2, 1, 0, 1, 0, 1]
+    assert sum(c.n_ha.value for c in f.classes) == pytest.approx(f.values["n_ha"].value)
+    assert sum(c.g_ha.value for c in f.classes) == pytest.approx(f.values["g_ha"].value)
+
+
+def test_clark_evans_tells_a_grid_from_random_and_clustered_stems():
+    random = np.random.default_rng(3)
+    side = 100.0
+
+    def index(position):
+        trees = trees_of([0.2] * len(position), position=position)
+        return figures(trees, area=side**2, perimeter=4 * side).values["clark_evans"]
+
+    grid = np.stack(np.meshgrid(np.arange(5, 100, 10.0), np.arange(5, 100, 10.0)), axis=-1).reshape(-1, 2)
+    drawn = [index(random.uniform(0, side, (100, 2))) for _ in range(200)]
+    centres = random.uniform(0, side, (10, 2))
+    clustered = np.clip(np.repeat(centres, 10, axis=0) + random.normal(0, 2, (100, 2)), 0, side)
+    values = np.array([i.value for i in drawn])
+    assert values.mean() == pytest.approx(1.0, abs=0.02)
+    assert values.std() == pytest.approx(drawn[0].se, rel=0.15)
+    assert index(grid).value > 1.8
+    assert index(clustered).value < 0.6
+    f = figures(trees_of([0.2] * 100, position=grid), area=side**2, perimeter=4 * side)
+    assert f.values["nearest_neighbour_m"] == pytest.approx((10.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("trees", "seen", "text"),
+    [
+        ([], 1000.0, "no trees"),
+        ([0.2] * 9, 1000.0, "only 9 trees"),
+        ([], 0.0, "observed"),
+        ([0.2], 100.0, "10 %"),
+    ],
+)
+def test_what_the_figures_cannot_rest_on_is_a_warning(trees, seen, text):
+    f = figures(trees_of(trees), seen=seen)
+    assert any(text in warning for warning in f.warnings)
+    assert not any(math.isinf(x) for value in f.values.values() for x in value)
+
+
+def test_a_plot_without_area_is_refused():
+    with pytest.raises(ValueError, match="no area"):
+        figures(trees_of([0.2]), area=0.0)
+
+
+@given(
+    st.lists(st.floats(0.05, 1.0) | st.just(math.nan), max_size=30),
+    st.floats(0.01, 1.0),
+    st.floats(0.05, 1.0),
+    st.floats(0.0, 0.05),
+)
+def test_figures_are_finite_or_unknown_and_errors_are_not_negative(dbh, share, p, sigma):
+    f = figures(trees_of(dbh, sigma), seen=1000.0 * share, detection=(p, 0.1 * p))
+    for value, se in f.values.values():
+        assert not math.isinf(value)
+        assert not se < 0.0
+    assert sum(c.trees for c in f.classes) + f.without_dbh == f.trees or not f.classes
+
+
+def test_plots_together_have_their_weighted_mean_and_the_error_between_them():
+    plots = {
+        name: figures(trees_of([0.2] * n), area=area)
+        for name, n, area in (("a", 20, 1000.0), ("b", 30, 1000.0), ("c", 25, 1000.0))
+    }
+    n = combined(plots)["n_ha"]
+    assert n.value == pytest.approx(250.0)
+    assert n.se == pytest.approx(50.0 / math.sqrt(3))
+    unequal = combined({"a": plots["a"], "b": figures(trees_of([0.2] * 90), area=3000.0)})["n_ha"]
+    assert unequal.value == pytest.approx(1e4 * 110 / 4000)
+    assert math.isnan(combined({"a": plots["a"]})["n_ha"].se)
+
+
+def test_volume_counts_the_trees_that_have_one():
+    trees = trees_of([0.2] * 12)
+    volume = np.array([0.5] * 9 + [np.nan] * 3)
+    with_volume = replace(trees, volume=volume, volume_sigma=np.where(np.isfinite(volume), 0.03, np.nan))
+    f = figures(with_volume, area=1000.0)
+    assert f.with_volume == 9
+    assert f.values["v_ha"] == (pytest.approx(45.0), pytest.approx(10.0 * 0.03 * 3.0))
+    assert f.values["v_ha_corrected"].value == pytest.approx(45.0)
+    assert any("volume of 9 of 12 trees" in text for text in f.warnings)
+    half = figures(with_volume, area=1000.0, seen=500.0, detection=(0.5, 0.0))
+    assert half.values["v_ha"].value == pytest.approx(90.0)
+    assert half.values["v_ha_corrected"].value == pytest.approx(180.0)
+    empty = figures(with_volume.where(np.zeros(12, np.bool_)), area=1000.0)
+    assert empty.values["v_ha"] == (0.0, 0.0)
+    assert combined({"a": f, "b": empty})["v_ha"].value == pytest.approx(22.5)
+    assert figures(trees).with_volume is None
+    assert math.isnan(figures(trees).values["v_ha"].value)
+
+
+def test_plain_figures_of_several_plots_refer_to_their_whole_area():
+    """Also to that of a plot that was not observed at all."""
+    inside = PlotTrees(np.array([[1.0, 1.0], [4.0, 4.0]]), np.full(2, 0.2), np.full(2, 0.01))
+    nothing = inside.where(np.zeros(2, np.bool_))
+    common: dict[str, Any] = {"perimeter": 40.0, "detection": (1.0, 0.0), "parameters": Stand()}
+    plots = {
+        "seen": stand_figures(inside, nothing, area=100.0, seen=100.0, **common),
+        "hidden": stand_figures(nothing, inside, area=300.0, seen=0.0, **common),
+    }
+    assert combined(plots)["n_ha_plain"].value == pytest.approx(1e4 * 4 / 400.0)
+    assert combined(plots)["n_ha"].value == pytest.approx(1e4 * 2 / 100.0)
