@@ -44,8 +44,8 @@ class Extension:
         web: Adds routes to the application of a dashboard (`app.state.dashboard`, `app.state.settings`),
             which are tried before those of the program; coroutine functions in the list `app.state.closing`
             are called at its end.
-        page: Folder of JavaScript whose main.js registers parts of the page
-            (static/js/shell/extensions.js), with main.css if it has one.
+        page: Folder of JavaScript whose main.js registers parts of the dashboard, and runs.js parts of the
+            page of runs (static/js/shell/extensions.js), with main.css and runs.css; each may be missing.
         formats: Returns formats of files and their readers, which are tried after those of the program.
         addresses: Dotted module by the scheme of the addresses of live sources. The module has `parse(uri)`,
             which returns an `app.robot.address.Address`, and `connect(address, inbox)`, which returns an

@@ -85,7 +85,7 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     assert name.evaluate("node => node.selectionEnd - node.selectionStart") == len("north")
     name.fill("south")
     name.press("Enter")
-    person.until_server("/api/annotations", "it.plots[3].name === 'south'")
+    person.until_server("/api/annotations", "it.others.plot[3].name === 'south'")
     page.get_by_label("Delete plot south").click()
     expect(rows).to_have_count(3)
     canvas.press("Control+z")

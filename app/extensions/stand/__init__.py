@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from app.extension import Extension
+from app.extension import Extension, page_folder
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -30,4 +30,5 @@ EXTENSION = Extension(
     },
     takes={"export": "app.extensions.stand.commands.export"},
     web=_add_routes,
+    page=page_folder("stand"),
 )

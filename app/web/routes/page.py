@@ -37,7 +37,7 @@ router = APIRouter()
 mimetypes.add_type("text/javascript", ".js")
 mimetypes.add_type("text/javascript", ".mjs")
 
-# Where index.html names the extensions.
+# Where a page names the extensions.
 _EXTENSIONS = "<!-- extensions -->"
 
 _CHECK_EACH_TIME = {"Cache-Control": "no-cache"}
@@ -58,7 +58,12 @@ _VISER_POLICY = (
 @router.get("/")
 def page(request: Request) -> Response:
     """GET /: return the dashboard with the modules of its extensions, or 304 if the browser has it."""
-    content = dashboard_page()
+    return _extended(request, "index.html", "main")
+
+
+def _extended(request: Request, page: str, name: str) -> Response:
+    """Return a page with the modules of extensions, see `page_with_extensions`, or 304."""
+    content = page_with_extensions(page, name)
     headers = {
         **_CHECK_EACH_TIME,
         "Content-Security-Policy": _PAGE_POLICY,
@@ -69,21 +74,29 @@ def page(request: Request) -> Response:
     return HTMLResponse(content, headers=headers)
 
 
-def dashboard_page() -> str:
-    """Return index.html with the style sheets and the JavaScript modules of the extensions that are switched
-    on in front of those of the dashboard, which starts what they register."""
-    pages = {name: each.page for name, each in extensions_on().items() if each.page is not None}
-    folders = {name: f"/static/{EXTENSION_PAGES}/{quote(name)}" for name in pages}
+def page_with_extensions(page: str, name: str) -> str:
+    """Return a page of this program with the JavaScript modules of the extensions that are switched on in
+    front of its own, which starts what they register, and their style sheets.
+
+    Args:
+        page: Name of its file, such as index.html.
+        name: Name of the modules and style sheets of extensions for it, without the suffix; those that an
+            extension does not have are left out.
+    """
+    pages = {each: found.page for each, found in extensions_on().items() if found.page is not None}
+    folders = {each: f"/static/{EXTENSION_PAGES}/{quote(each)}" for each in pages}
     styles = [
-        f'<link rel="stylesheet" href="{folders[name]}/main.css">'
-        for name, page in pages.items()
-        if (page / "main.css").is_file()
+        f'<link rel="stylesheet" href="{folders[each]}/{name}.css">'
+        for each, folder in pages.items()
+        if (folder / f"{name}.css").is_file()
     ]
     modules = [
-        f'<script type="module" data-extension="{html.escape(name)}" src="{folder}/main.js"></script>'
-        for name, folder in folders.items()
+        f'<script type="module" data-extension="{html.escape(each)}" src="{folders[each]}/{name}.js">'
+        "</script>"
+        for each, folder in pages.items()
+        if (folder / f"{name}.js").is_file()
     ]
-    text = (static_folder() / "index.html").read_text(encoding="utf-8")
+    text = (static_folder() / page).read_text(encoding="utf-8")
     return text.replace(_EXTENSIONS, "\n  ".join([*styles, *modules]))
 
 
@@ -96,8 +109,9 @@ async def health(dashboard: Dash) -> Response:
 
 @router.get("/runs")
 def runs_page(request: Request) -> Response:
-    """GET /runs: return the page of all runs, or 304 if the browser has it."""
-    return _file(request, static_folder() / "runs.html", _PAGE_POLICY)
+    """GET /runs: return the page of all runs with the modules of its extensions, or 304 if the browser has
+    it."""
+    return _extended(request, "runs.html", "runs")
 
 
 @router.get("/api/access")

@@ -5,7 +5,7 @@ import { byId, el } from "./dom.js";
 import { showProblem } from "./problem.js";
 
 // Controls that change something for everybody or give the server work. Of the panels only the contents, so that they scroll.
-const CONTROLS = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open", "#plots-edit"];
+const CONTROLS = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open", "[data-edits]"];
 const PANELS = ["panel-annotate", "panel-tune"];
 
 export let access = { role: "owner", viewer_link: null, viewers: null };

@@ -11,8 +11,7 @@ import { distance, nearest } from "../core/nearest.js";
 import { clusters, isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { openStory } from "../explain/story.js";
-import { drawPlots } from "../plots/draw.js";
-import { clickOn, dragTo, drawing, hoverTo, plots, pressAt, release } from "../plots/plots.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { drawMap, treeAt } from "./draw.js";
 import { boundsOf, MapCanvas } from "./map_canvas.js";
 import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
@@ -21,6 +20,8 @@ const BUTTONS_HEIGHT = 54; // [px] at the upper edge
 const LEGEND_EVERY = 500; // [ms] between two updates
 const POINT_REACH = 9; // [px] around clusters and ground truth
 const canvas = byId("map");
+// Whether a tool of an extension takes an event.
+const byTool = (name, ...args) => ofExtensions("mapTools").some((tool) => tool[name](...args));
 
 const map = new MapCanvas(canvas, {
   top: BUTTONS_HEIGHT,
@@ -30,18 +31,18 @@ const map = new MapCanvas(canvas, {
   paint(pen, view) {
     drawSection(pen, view);
     drawMap(pen, view, state, isRejected);
-    drawPlots(pen, view);
+    ofExtensions("drawOnMap", pen, view);
     drawAnnotations(pen, view);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
     canvas.setAttribute("aria-label", `Map: ${trees().length} trees${isCloud() ? "" : " and the robot's path"}. The table below lists the trees.${measured}`);
   },
   gestures: {
-    press: (at) => pressAt(at, map.view) || measuring() || grab(at, map.view),
-    drag: (at, travelled) => dragTo(at, map.view, travelled) || drag(at, map.view, travelled),
-    release: () => release() || drop(),
-    hover: (at) => hoverTo(at, map.view) || (measuring() ? measureTowards(snapped(at)) : hoverAt(at, map.view)),
+    press: (at) => byTool("press", at, map.view) || measuring() || grab(at, map.view),
+    drag: (at, travelled) => byTool("drag", at, map.view, travelled) || drag(at, map.view, travelled),
+    release: () => byTool("release") || drop(),
+    hover: (at) => byTool("hover", at, map.view) || (measuring() ? measureTowards(snapped(at)) : hoverAt(at, map.view)),
     click: (at) => {
-      if (clickOn(at, map.view)) return;
+      if (byTool("click", at, map.view)) return;
       if (measuring()) measureAt(snapped(at));
       else if (!clickAt(at, map.view, treeAt(trees(), at, map.view))) choose(at);
     },
@@ -61,7 +62,7 @@ function describe(at) {
   const [tree, truth, cluster] = [treeAt(trees(), at, map.view), truthAt(at), clusterAt(at)];
   canvas.classList.toggle("hits", Boolean(tree ?? cluster ?? truth));
   if (measuring()) return state.measure.from === null ? "Click where the distance begins" : "";
-  if (draft.adding || drawing() || !(tree ?? truth ?? cluster)) return "";
+  if (draft.adding || byTool("busy") || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isCloud() ? `height ${heightText(tree)}` : seenText(tree));
   else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict === "tree" && !isCloud() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
@@ -88,7 +89,7 @@ const isRejected = (tree) => reviewOf(tree) === "rejected";
 // The legend names what the map shows.
 function showLegend() {
   const kinds = (state.truth ?? []).map(({ kind }) => kind);
-  const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"), plot: plots().length,
+  const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"),
     hollow: trees().some((tree) => tree.dbh_cm === null), odometry: !isCloud() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
   setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");

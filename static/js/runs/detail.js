@@ -4,9 +4,9 @@ import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
 import { clock, count, figure, NONE } from "../core/format.js";
-import { reportMenu } from "../core/report.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { isRejected, mapPicture, paintRun, treeText } from "./draw.js";
 import { FIGURES, SCORES, shortSource, when } from "./figures.js";
 
@@ -91,7 +91,7 @@ function more(run, map) {
   return el("div", { class: "run-more" },
     el("div", { class: "row" },
       el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(fileName(title, "map.png"), map.canvas) }),
-      reportMenu("run-report", run.key, () => title),
+      ...ofExtensions("runButtons", run, title),
       el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(fileName(title, "trees.csv"), treeRows(run.map.trees)) })),
     ...(run.scores ? [el("div", {}, el("h3", { text: `Scores${typeof run.scores.reach_m === "number" ? ` (TA, FR, TR and FA within ${figure(run.scores.reach_m)} m of the path)` : ""}` }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
     el("div", {}, el("h3", { text: "Differences from the preset" }), Object.keys(run.differences).length

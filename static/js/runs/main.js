@@ -7,7 +7,7 @@ import { startAccess } from "../core/permissions.js";
 import { on } from "../core/store.js";
 import { startTheme } from "../core/theme.js";
 import { startUpload } from "../open/upload.js";
-import { showTwo } from "./compare.js";
+import { ofExtensions, startExtensions } from "../shell/extensions.js";
 import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
@@ -96,9 +96,10 @@ function go(hash) {
 function follow() {
   const { run, compare } = chosen();
   markTicked();
-  if (compare.length === 2) showTwo(...compare);
+  const [showTwo] = ofExtensions("pairViews");
+  if (compare.length === 2 && showTwo) showTwo(...compare);
   else if (run) showRun(run, { replay, rename, remove });
-  else say("Choose a run to see its map, or tick two runs to compare them: growth, new, missing and moved trees.");
+  else say(`Choose a run to see its map${showTwo ? ", or tick two runs to compare them: growth, new, missing and moved trees" : ""}.`);
 }
 
 async function replay(run) {
@@ -155,6 +156,8 @@ startUpload(async ({ uri }) => {
   location.href = "/";
 });
 startTheme();
+startExtensions();
+byId("runs-compare").hidden = !ofExtensions("pairViews").length;
 startAccess();
 load();
 follow();

@@ -11,7 +11,6 @@ import { advance, togglePlay } from "../playback/timeline.js";
 import { toggleFocus } from "../scene/focus.js";
 import { toggleFollow } from "../scene/layers.js";
 import { closeOver, openOver } from "../scene/overlay.js";
-import { draw } from "../plots/plots.js";
 import { pressInScene } from "../scene/scene.js";
 import { openSearch } from "../tune/panel.js";
 import { redo, reset, undo } from "../tune/parameters.js";
@@ -76,11 +75,8 @@ export const ACTIONS = [
   ["Save the map as a picture (PNG)", "", "", click("map-png"), null, "screenshot image export"], ["Save the map as a table (CSV)", "", "", click("map-csv")],
   ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
   ["Download the trees as CSV", "", "", () => byId("trees-csv").click(), null, "export table spreadsheet"],
-  ["Export the map: GeoPackage, Shapefile, DXF, XLSX …", "", "", () => { toTab("trees")(); byId("trees-export").focus(); }, null, "save download gis qgis cad excel geojson"],
-  ["Report of the run as HTML or PDF: figures, map, plots, trees", "", "", () => { toTab("plots")(); byId("plots-report").focus(); }, null, "print page bericht stand inventory"],
+  ["Export the map: GeoPackage, GeoJSON …", "", "", () => { toTab("trees")(); byId("trees-export").focus(); }, null, "save download gis qgis geojson"],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
-  ...["circle", "rectangle", "polygon"].map((kind) => [`Plots: draw a ${kind} on the map`, "", "", edits(() => { toTab("plots")(); draw(kind); }), null, "stand inventory sample area hectare basal"]),
-  ["Plots: import a file", "", "", edits(() => { toTab("plots")(); byId("plot-import").click(); }), null, "geopackage shapefile geojson gis"],
   ["Annotate: add trees by clicks on the map", "a", "", inAnnotate(() => toggleAdding(true)), ""],
   ["Annotate: skip to the next tree to review", "s", "", inAnnotate(skip), ""],
   ["Annotate: the selected tree is a tree", "y", "", inAnnotate(() => review("tree")), ""],

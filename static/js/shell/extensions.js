@@ -1,10 +1,21 @@
-// Parts of the extensions that are switched on. The page names the module of each in front of main.js; such a module
-// calls extend() with
-//   start()           called once, when the parts of the dashboard have started and before the server sends states
+// Parts of the extensions that are switched on. The dashboard names the module main.js of each in front of its own, the page of
+// runs runs.js; such a module calls extend() with
+//   start()           called once, when the parts of the page have started and before the server sends states
+//   tabs()            tabs below the map, [{name, title, before}, ...], with the name of the tab behind it; start() fills the panel
+//                     with the id panel-NAME
 //   presentActions()  actions for the search, [[title, keys, action, keywords], ...], which may depend on the run
 //   annotateSections()  elements at the end of the tab Annotate
 //   tuneParts()       elements at the end of the tab Tune
 //   parameterButtons(spec)  buttons in the row of a parameter in the tab Tune
+//   pressed(event)    whether it took a key that was pressed; not called in a view-only page
+//   drawOnMap(pen, view)  draws on the 2D map, below the annotations
+//   mapTools()        tools for the pointer on the 2D map, [{busy, press, drag, release, hover, click}, ...]; the functions take what
+//                     those of `gestures` of MapCanvas take, then the view, and return whether they took the event; busy() is true
+//                     while the tool is in use
+//   exportFiles()     files for the menu Export, [{value, text, before, save}, ...], with the value of the option behind it; save(title)
+//                     saves the file of a run with this title, also in place of an option with the same value
+//   runButtons(run, title)  buttons of a run on the page of runs
+//   pairViews()       what shows two runs on that page: functions of their keys
 // All are optional.
 
 import { attempted, showProblem } from "../core/problem.js";
@@ -20,7 +31,7 @@ export function startExtensions() {
   for (const { start } of extensions.values()) attempted(async () => start?.());
 }
 
-// What the extensions give by a function, in one list; one that fails is reported and gives nothing.
+// What the extensions give by a function, in one list, undefined as nothing; one that fails is reported and gives nothing.
 export const ofExtensions = (name, ...args) => [...extensions.values()].flatMap((each) => {
   try {
     return each[name]?.(...args) ?? [];

@@ -7,9 +7,9 @@ import { edits, looksOnly } from "../core/permissions.js";
 import { advance } from "../playback/timeline.js";
 import { toggleLayer } from "../scene/layers.js";
 import { onSceneLoad, pressInScene } from "../scene/scene.js";
-import { plotKey } from "../plots/panel.js";
 import { tuneKey } from "../tune/parameters.js";
 import { ACTIONS, showSheet } from "./actions.js";
+import { ofExtensions } from "./extensions.js";
 import { openPalette } from "./palette.js";
 
 const TYPES = "input:not([type=range]), textarea, select, [contenteditable], [role=slider], [role=combobox], [role=option]";
@@ -38,7 +38,7 @@ function act(event, inScene) {
     if (inScene && ["f", "t", "b"].includes(event.key)) take(); // keys of viser
     return;
   }
-  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || plotKey(event) || tuneKey(event))) {
+  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || ofExtensions("pressed", event).some(Boolean) || tuneKey(event))) {
     take();
     return;
   }

@@ -15,7 +15,6 @@ import { startWelcome } from "../open/welcome.js";
 import { startMarks } from "../playback/event_marks.js";
 import { startTimeline } from "../playback/timeline.js";
 import { startCharts } from "../charts/charts.js";
-import { startPlotsPanel } from "../plots/panel.js";
 import { startCamera } from "../scene/camera.js";
 import { startDimming } from "../scene/dimming.js";
 import { startFocus } from "../scene/focus.js";
@@ -40,7 +39,7 @@ import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
-for (const start of [startTheme, startLayout, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startPlotsPanel, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
+for (const start of [startTheme, startLayout, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
   startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startWelcome, startShare, startExtensions]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

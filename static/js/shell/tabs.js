@@ -1,9 +1,10 @@
 // The tabs below the map (ARIA pattern), and the drawer that holds map and tabs in a narrow window.
 
-import { byId, recall, remember } from "../core/dom.js";
+import { byId, el, recall, remember } from "../core/dom.js";
 import { changed } from "../core/store.js";
+import { ofExtensions } from "./extensions.js";
 
-export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "scores", "plots", "charts"];
+export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "scores", "charts"];
 let current = NAMES[0];
 
 export const visible = (name) => name === current;
@@ -19,7 +20,14 @@ export function openTab(name) {
   changed("tab");
 }
 
+function addTab({ name, title, before }) {
+  byId(`tab-${before}`).before(el("button", { role: "tab", id: `tab-${name}`, "aria-controls": `panel-${name}`, "aria-selected": "false", tabindex: "-1", text: title }));
+  byId(`panel-${before}`).before(el("section", { id: `panel-${name}`, class: "panel", role: "tabpanel", "aria-labelledby": `tab-${name}`, hidden: true }));
+  NAMES.splice(NAMES.indexOf(before), 0, name);
+}
+
 export function startTabs() {
+  ofExtensions("tabs").forEach(addTab);
   for (const [place, name] of NAMES.entries()) {
     const tab = byId(`tab-${name}`);
     tab.addEventListener("click", () => openTab(name));

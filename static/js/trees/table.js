@@ -7,14 +7,14 @@ import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed, isAssumed, NONE, plusMinus } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
-import { isReport, reportOptions, saveReport, saveWritten } from "../core/report.js";
 import { roving } from "../core/roving.js";
 import { changed, isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
+import { saveWritten } from "../core/written_file.js";
 import { openStory } from "../explain/story.js";
 import { titleOf } from "../open/run_title.js";
-import { settings } from "../plots/panel.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { openTab, visible } from "../shell/tabs.js";
 import { filterOf, HELP, sigma } from "./filter.js";
 
@@ -143,12 +143,12 @@ function offerCsv(any) {
   csv.title = any ? csvTitle : "No tree yet";
 }
 
-// The server writes the file, so that it is the same as that of `stemmap export`. A Shapefile comes as a zip archive.
+// The server writes the file, so that it is the same as that of `stemmap export`.
 function exportAs(format) {
   const title = titleOf(state.status?.source);
-  if (isReport(format)) return saveReport("open", title, format, settings());
-  const name = { shp: "trees_shp.zip", laz: "cloud.laz", tif: "terrain.tif" }[format] ?? `trees.${format}`;
-  return saveWritten("Writing the file …", fileName(title, name), `/api/export/${format}?${settings()}`);
+  const own = ofExtensions("exportFiles").find(({ value }) => value === format);
+  if (own) return own.save(title);
+  return saveWritten("Writing the file …", fileName(title, format === "laz" ? "cloud.laz" : `trees.${format}`), `/api/export/${format}`);
 }
 
 function emptyText(all, wanted, refused) {
@@ -185,7 +185,8 @@ export function startTable() {
   byId("find").addEventListener("input", fill);
   byId("find").title = HELP;
   const menu = byId("trees-export");
-  menu.append(...reportOptions());
+  const optionOf = (value) => [...menu.options].find((each) => each.value === value) ?? null;
+  for (const { value, text, before } of ofExtensions("exportFiles")) if (!optionOf(value)) menu.add(el("option", { value, text }), before ? optionOf(before) : null);
   menu.addEventListener("change", () => { exportAs(menu.value); menu.value = ""; });
   byId("trees-png").addEventListener("click", () => saveCanvas(fileName(titleOf(state.status?.source), "trees.png"), pictureOf(byId("trees"))));
   csv.addEventListener("click", (event) => {

@@ -1,9 +1,9 @@
 // Plots for stand figures: their edits, which are sent and undone like annotations, and drawing them on the map.
 
-import { edit, send } from "../annotate/annotations.js";
-import { changed, state, trees } from "../core/store.js";
-import { treeAt } from "../map/draw.js";
-import { visible } from "../shell/tabs.js";
+import { edit, send } from "../../annotate/annotations.js";
+import { changed, state, trees } from "../../core/store.js";
+import { treeAt } from "../../map/draw.js";
+import { visible } from "../../shell/tabs.js";
 
 export const SHAPES = { circle: "Circle", rectangle: "Rectangle", polygon: "Polygon" };
 const CLOSING = 10; // [px] around the first corner, where a click closes a polygon

@@ -1,16 +1,16 @@
 // The tab Plots: draw, type, import and list plots, with the stand figures of each plot and of all.
 
-import { draft, redo, remove, reviewOf, rows as annotations, STATES, treeNumberOf, undo } from "../annotate/annotations.js";
-import { get } from "../core/api.js";
-import { button, byId, el, recall, remember, setText } from "../core/dom.js";
-import { count, figure, percent, plusMinus, withSigma } from "../core/format.js";
-import { looksOnly } from "../core/permissions.js";
-import { reportMenu } from "../core/report.js";
-import { on, state, trees } from "../core/store.js";
-import { keepFresh } from "../core/timing.js";
-import { titleOf } from "../open/run_title.js";
+import { draft, redo, remove, reviewOf, rows as annotations, STATES, treeNumberOf, undo } from "../../annotate/annotations.js";
+import { get } from "../../core/api.js";
+import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
+import { count, figure, percent, plusMinus, withSigma } from "../../core/format.js";
+import { looksOnly } from "../../core/permissions.js";
+import { on, state, trees } from "../../core/store.js";
+import { keepFresh } from "../../core/timing.js";
+import { titleOf } from "../../open/run_title.js";
 import { startCoordinates } from "./coordinates.js";
 import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plots, plotting, SHAPES, sketch, stopDrawing } from "./plots.js";
+import { reportMenu } from "./report.js";
 
 const pause = () => (state.status?.state === "playing" ? 3000 : 300); // [ms] between two requests
 const LARGEST_FILES = 700_000; // [bytes]
@@ -93,7 +93,7 @@ function setting(name, label, value, title, type, placeholder = "") {
 
 function build() {
   byId("panel-plots").replaceChildren(
-    el("div", { id: "plots-edit" },
+    el("div", { id: "plots-edit", "data-edits": true },
       el("div", { class: "annotate-head" }, el("span", { class: "dim", text: "Draw" }),
         ...Object.entries(SHAPES).map(([kind, text]) => button(`plot-${kind}`, text, `Draw a ${kind} on the map`, () => draw(kind))), el("span", { class: "grow" }),
         button("plot-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("plot-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),

@@ -1,10 +1,10 @@
 // Coordinates of the country: control points, GNSS fixes or values by hand, from which the server finds the reference system
 // of the map. Files, plots and the report have it then.
 
-import { draft, edit, news, remove, send } from "../annotate/annotations.js";
-import { button, byId, el, recall, remember, setText } from "../core/dom.js";
-import { count, fixed, NONE } from "../core/format.js";
-import { on, selectedTree, state, treeOf } from "../core/store.js";
+import { draft, edit, news, remove, send } from "../../annotate/annotations.js";
+import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
+import { count, fixed, NONE } from "../../core/format.js";
+import { on, selectedTree, state, treeOf } from "../../core/store.js";
 import { draw, plotting, sketch } from "./plots.js";
 
 const HOW = { control: "control points", gnss: "GNSS fixes of the recording", hand: "values by hand", file: "coordinates of the file, already in the system" };

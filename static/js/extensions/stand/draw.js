@@ -1,8 +1,8 @@
 // Plots on the 2D map: dashed outlines with their names, and the shape that is being drawn.
 
-import { treeOf } from "../core/store.js";
-import { colours } from "../core/theme.js";
-import { drawCircle, drawText } from "../map/draw.js";
+import { treeOf } from "../../core/store.js";
+import { colours } from "../../core/theme.js";
+import { drawCircle, drawText } from "../../map/draw.js";
 import { controlPoints, titleOf } from "./coordinates.js";
 import { drawing, plots, ringsOf, shapeOf, sketch } from "./plots.js";
 

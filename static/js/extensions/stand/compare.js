@@ -1,14 +1,15 @@
 // Two visits compared: overlaid maps, growth, new, missing and moved trees, scores and parameters.
 
-import { get } from "../core/api.js";
-import { el } from "../core/dom.js";
-import { saveBytes, saveCanvas } from "../core/download.js";
-import { count, figure, fixed, NONE } from "../core/format.js";
-import { treeAt } from "../map/draw.js";
-import { boundsOf } from "../map/map_canvas.js";
-import { put, say, table } from "./detail.js";
-import { mapPicture, paintTwo } from "./draw.js";
-import { FIGURES, SCORES, when } from "./figures.js";
+import { get } from "../../core/api.js";
+import { el } from "../../core/dom.js";
+import { saveBytes, saveCanvas } from "../../core/download.js";
+import { count, figure, fixed, NONE } from "../../core/format.js";
+import { treeAt } from "../../map/draw.js";
+import { boundsOf } from "../../map/map_canvas.js";
+import { put, say, table } from "../../runs/detail.js";
+import { mapPicture } from "../../runs/draw.js";
+import { FIGURES, SCORES, when } from "../../runs/figures.js";
+import { paintTwo } from "./draw_compared.js";
 
 const ORDER = ["moved", "missing", "new", "same", "not seen in a", "not seen in b", "rejected in a", "rejected in b"];
 const words = (status) => status.replace(/ [ab]$/, (name) => name.toUpperCase());
