@@ -87,9 +87,7 @@ ROUTES = [
     ("GET", "/api/uploads"),
     ("POST", "/api/uploads"),
     ("GET", "/api/runs"),
-    ("GET", "/api/runs/compare"),
     ("GET", "/api/runs/{key}"),
-    ("GET", "/api/runs/{key}/report/{suffix}"),
     ("PATCH", "/api/runs/{number}"),
     ("DELETE", "/api/runs/{number}"),
     ("POST", "/api/runs/{number}/restore"),
@@ -113,12 +111,6 @@ ROUTES = [
     ("PUT", "/api/annotations/against"),
     ("GET", "/api/annotations.csv"),
     ("GET", "/api/annotations.geojson"),
-    ("GET", "/api/plots"),
-    ("POST", "/api/plots"),
-    ("POST", "/api/plots/along"),
-    ("POST", "/api/plots/import"),
-    ("PATCH", "/api/plots/{number}"),
-    ("PUT", "/api/georeference"),
     ("GET", "/no/such/route"),
 ]
 MISSES = {("GET", "/static/index.html"), ("GET", "/static/no-such-file.js")}
