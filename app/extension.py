@@ -50,6 +50,11 @@ class Extension:
         addresses: Dotted module by the scheme of the addresses of live sources. The module has `parse(uri)`,
             which returns an `app.robot.address.Address`, and `connect(address, inbox)`, which returns an
             `app.robot.link.Link`.
+        sources: Dotted module of sources that are mapped in one step instead of scan by scan. The module has
+            `WHAT`, their name for people, `takes(uri, options)`, which returns whether a source is one of
+            them, `check(uri, options)`, which raises SourceError for one that cannot be opened, and
+            `open_source(uri, options)`, which returns an `app.sources.one_step.OneStepSource`. `takes` and
+            `check` are called in the web process. If the extension is switched off, its sources are refused.
     """
 
     help: str
@@ -59,6 +64,7 @@ class Extension:
     page: Path | None = None
     formats: Callable[[], Iterable[Format]] | None = None
     addresses: Mapping[str, str] = field(default_factory=dict)
+    sources: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +120,11 @@ def problems() -> Iterator[str]:
     for name in sorted((wanted_names() or frozenset()) - {each.name for each in found}):
         known = ", ".join(each.name for each in found) or "none"
         yield f"there is no extension {name!r}, which {VARIABLE} names; known: {known}"
+
+
+def switched_off(extension: str) -> str:
+    """Return the remedy of an error whose reason is that an extension is switched off."""
+    return f"The extension {extension} is switched off by {VARIABLE}."
 
 
 @cache

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from app.batch.run_folder import is_of_cloud, read_run_record
+from app.batch.run_folder import is_of_drive, read_run_record
 from app.batch.summary import RunTotals
 from app.sources.opening import open_source
 from app.store.forests import mapper_of
@@ -102,8 +102,8 @@ def read_saved_run(folder: Path) -> SavedRun:
     """Read the saved state in the folder of a run.
 
     Raises:
-        StemmapError: There is none, it is larger than 4 GB, damaged or has another version, or the folder is
-            that of a whole cloud.
+        StemmapError: There is none, it is larger than 4 GB, damaged or has another version, or the map is
+            not that of a drive.
     """
     file = folder / STATE
     try:
@@ -111,11 +111,11 @@ def read_saved_run(folder: Path) -> SavedRun:
             raise damaged(str(file), "it is larger than 4 GB")
         data = file.read_bytes()
     except OSError as error:
-        if _is_map_of_cloud(folder):
+        if _is_without_drive(folder):
             raise StemmapError(
-                "this is the map of a whole cloud, which cannot be continued",
+                "this is no map of a drive and cannot be continued",
                 where=str(folder),
-                remedy="Map a drive and continue that map, or drive through the cloud with sim:cloud?file=",
+                remedy="Map a drive and continue that map",
             ) from None
         raise StemmapError(
             f"there is no saved state: {error.strerror}",
@@ -142,10 +142,10 @@ def read_saved_run(folder: Path) -> SavedRun:
     return saved
 
 
-def _is_map_of_cloud(folder: Path) -> bool:
-    """Return whether a folder has the map of a whole cloud; False if it has no map."""
+def _is_without_drive(folder: Path) -> bool:
+    """Return whether a folder has a map, and it is no map of a drive."""
     try:
-        return is_of_cloud(read_run_record(folder))
+        return not is_of_drive(read_run_record(folder))
     except StemmapError:
         return False
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from app.batch.run_folder import is_of_cloud, read_run_record
+from app.batch.run_folder import is_of_drive, read_run_record
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_beside
@@ -153,7 +153,7 @@ def reproject(points: Float, source: str, target: str) -> Float:
 
 
 def read_map_frame(folder: FilePath) -> MapFrame:
-    """Return the frame of the map of a run: that of georeference.json, else that of a whole cloud with a
+    """Return the frame of the map of a run: that of georeference.json, else that of a source of one step with a
     known reference system, else the local one.
 
     Raises:
@@ -165,7 +165,7 @@ def read_map_frame(folder: FilePath) -> MapFrame:
     record = read_run_record(folder)
     file = folder / FILE
     if not file.is_file():
-        crs = str(record["source"].get("crs") or "") if is_of_cloud(record) else ""
+        crs = "" if is_of_drive(record) else str(record["source"].get("crs") or "")
         try:
             return MapFrame(_known(crs), method="cloud" if crs else "")
         except pyproj.exceptions.ProjError:  # `stemmap map` warned of it

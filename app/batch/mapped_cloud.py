@@ -22,7 +22,7 @@ from pipeline.io.result_files import ODOMETRY
 if TYPE_CHECKING:
     from pipeline.io.readers import Source
     from pipeline.odometry.synchroniser import OdometryChoice
-    from pipeline.types.records import Step, WholeCloud
+    from pipeline.types.records import Step
 
 EVERY = 5  # scans of a drive between two that are used
 MARGIN = 0.10  # m around the trunk at breast height, for lean and roughness of the stem
@@ -36,8 +36,8 @@ UNCLASSIFIED, GROUND_CLASS, HIGH_VEGETATION = 1, 2, 5
 def write_cloud(folder: FilePath, file: FilePath) -> int:
     """Write the cloud of a run; return the number of points.
 
-    A whole cloud keeps its points and coordinates. Every EVERY-th scan of a drive is read again from the
-    source, placed by the path of the run, and thinned. Points within GROUND of the terrain have class 2.
+    A source of one step keeps its points and coordinates. Every EVERY-th scan of a drive is read again from
+    the source, placed by the path of the run, and thinned. Points within GROUND of the terrain have class 2.
     Other points have class 5 and the number of the nearest tree in the field `tree` if their horizontal
     distance from the tree is at most its radius plus MARGIN (UNKNOWN_RADIUS for a tree without a diameter),
     at any height. The rest has class 1. `tree` is 0 for all points without class 5.
@@ -53,7 +53,7 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
     import laspy
     from scipy.spatial import cKDTree
 
-    from app.sources.opening import open_cloud
+    from app.sources.one_step import open_one_step
 
     run, frame, terrain = read_run(folder), read_map_frame(folder), read_terrain(folder)
     trees = run.trees
@@ -62,8 +62,8 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.add_extra_dim(laspy.ExtraBytesParams("tree", np.uint32, "number of the tree"))
     header.generating_software = "stemmap"
-    cloud = open_cloud(run.uri) if run.of_cloud else None
-    is_of_drive = cloud is None or cloud.description.cut_above
+    source = None if run.of_drive else open_one_step(run.uri)
+    is_of_drive = source is None or source.is_cut_above
     header.system_identifier = SYSTEM_OF_DRIVE if is_of_drive else "stemmap"
     header.creation_date = datetime.date(2000, 1, 1)  # the same run gives the same bytes
     header.scales = np.full(3, 0.001)
@@ -73,7 +73,7 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
         import pyproj
 
         header.add_crs(pyproj.CRS.from_user_input(frame.crs))
-    parts = _parts_of_drive(folder) if cloud is None else _parts_of_cloud(cloud)
+    parts = _parts_of_drive(folder) if source is None else source.points()
     written = 0
     is_laz = file.suffix.lower() == ".laz"
     with write_beside(file) as partial, laspy.open(partial, "w", header=header, do_compress=is_laz) as writer:
@@ -96,12 +96,6 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
             writer.write_points(record)
             written += len(points)
     return written
-
-
-def _parts_of_cloud(cloud: WholeCloud) -> Iterator[Float]:
-    """Yield the points of a whole cloud in its own coordinates, shape (N, 3) [m]."""
-    for part in cloud.parts():
-        yield part[:, :3].astype(np.float64) + cloud.description.offset
 
 
 def _every(source: Source, odometry: OdometryChoice) -> Iterator[tuple[int, Step]]:
@@ -133,8 +127,8 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     from app.robot.address import is_live
     from app.sources.opening import open_source
     from app.sources.request import FILE, request_of_kept, with_odometry
+    from pipeline.geometry.thinning import Thinned
     from pipeline.ground.scan_ground import find_terrain, height_above
-    from pipeline.inventory.cloud import Thinned
     from pipeline.preprocessing import acquire
 
     run, terrain = read_run(folder), read_terrain(folder)

@@ -64,7 +64,7 @@ class FinishedRun:
         reviews: Dict from the number of each tree to the state of its review, not "rejected", see
             `REVIEWS`.
         rejected: Number of rejected trees.
-        of_cloud: Whether a whole cloud was mapped, which has an empty path.
+        of_drive: Whether it is the map of a drive; another map has an empty path.
     """
 
     record: dict[str, Any]
@@ -75,7 +75,7 @@ class FinishedRun:
     trees: Trees
     reviews: dict[int, str]
     rejected: int
-    of_cloud: bool
+    of_drive: bool
 
 
 def read_run(folder: FilePath) -> FinishedRun:
@@ -104,7 +104,7 @@ def read_run(folder: FilePath) -> FinishedRun:
         trees,
         dict(zip(trees.number.tolist(), (state for state in states if state != REJECTED), strict=True)),
         int(np.count_nonzero(~kept)),
-        is_of_cloud(record),
+        is_of_drive(record),
     )
 
 
@@ -164,9 +164,10 @@ def recorded_time(kind: str, start_ns: int) -> dict[str, str]:
     return {"recorded": datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat()}
 
 
-def is_of_cloud(record: dict[str, Any]) -> bool:
-    """Return whether a record (run.json) is that of the map of a whole cloud."""
-    return isinstance(record.get("source"), dict) and "offset_m" in record["source"]
+def is_of_drive(record: dict[str, Any]) -> bool:
+    """Return whether a record (run.json) is that of the map of a drive, not of a source that was mapped in
+    one step."""
+    return not (isinstance(record.get("source"), dict) and "offset_m" in record["source"])
 
 
 def crs_unit(record: dict[str, Any]) -> tuple[float, float]:
@@ -182,13 +183,13 @@ def crs_unit(record: dict[str, Any]) -> tuple[float, float]:
 def truth_in_metres(
     truth: TruthTrees, unit: tuple[float, float], near: Float | Sequence[float]
 ) -> TruthTrees:
-    """Return true trees in metres. Those of a cloud in feet may be in either unit: the one in which they lie
-    nearer to the cloud.
+    """Return true trees in metres. Those of a file in feet may be in either unit: the one in which they lie
+    nearer to its points.
 
     Args:
         truth: True trees in the coordinates of the file or in metres.
         unit: Metres per unit of the reference system, see `crs_unit`.
-        near: A position in the cloud, x, y [m].
+        near: A position in the file, x, y [m].
     """
     if unit == (1.0, 1.0) or not len(truth.x):
         return truth
@@ -237,12 +238,12 @@ def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
 
 
 _NOTHING = np.zeros(0)
-#: Path of the map of a whole cloud.
+#: Path of a map without a drive.
 NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 
 def score_map(trees: Trees, path: Path, truth: TruthTrees, parameters: Parameters) -> MapScores:
-    """Return the scores of a map, see `evaluate`. With an empty path, as that of a whole cloud, all true
+    """Return the scores of a map, see `evaluate`. With an empty path, as without a drive, all true
     trees count, else those within `evaluation.reach` of it.
 
     Args:

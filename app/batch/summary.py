@@ -319,9 +319,9 @@ def evaluation_lines(e: MapScores, *, whole: bool = False) -> list[str]:
 
     Args:
         e: The scores.
-        whole: Whether a whole cloud was mapped, so that all true trees count.
+        whole: Whether all true trees count, as without a drive.
     """
-    where = "in the whole cloud" if whole else f"within {e.reach:g} m of the path"
+    where = "in the whole plot" if whole else f"within {e.reach:g} m of the path"
     return [
         f"trees found (TA) {rate_text(e.TA)}, missed (FR) {rate_text(e.FR)} {where}",
         f"other objects left out (TR) {rate_text(e.TR)}, mapped as trees (FA) {rate_text(e.FA)}; "

@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from app.common.text import version
-from app.extension import VARIABLE, all_extensions, extensions_on, problems
+from app.extension import all_extensions, extensions_on, problems, switched_off
 from pipeline.errors import ParameterError, StemmapError, UsageError
 
 COMMANDS = (
@@ -158,7 +158,7 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
         for each in all_extensions()
         if not each.is_on and each.extension is not None and command in each.extension.takes
     ]
-    hint = f"Did you mean {near[0]}? " if near else f"{_switched_off(takers_off[0])} " if takers_off else ""
+    hint = f"Did you mean {near[0]}? " if near else f"{switched_off(takers_off[0])} " if takers_off else ""
     raise UsageError(
         f"stemmap {command} does not know {' '.join(unknown)}", remedy=f"{hint}See stemmap {command} --help"
     )
@@ -181,14 +181,9 @@ def _check_command(words: list[str]) -> None:
         return
     for each in all_extensions():
         if not each.is_on and each.extension is not None and words[1] in each.extension.commands:
-            raise UsageError(f"there is no command {words[1]!r}", remedy=_switched_off(each.name))
+            raise UsageError(f"there is no command {words[1]!r}", remedy=switched_off(each.name))
     if near := difflib.get_close_matches(words[1], commands(), n=1, cutoff=0.6):
         raise UsageError(f"there is no command {words[1]!r}", remedy=f"Did you mean `stemmap {near[0]}`?")
-
-
-def _switched_off(extension: str) -> str:
-    """Return the remedy of an error whose reason is that an extension is switched off."""
-    return f"The extension {extension} is switched off by {VARIABLE}."
 
 
 @contextlib.contextmanager

@@ -85,7 +85,7 @@ def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) ->
     Args:
         arguments: Arguments of the command.
         evaluation: The scores.
-        whole: Whether the run is a whole cloud.
+        whole: Whether all true trees count, as without a drive.
     """
     from app.batch.summary import evaluation_lines
 
@@ -98,7 +98,7 @@ def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) ->
 
 
 def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]:
-    """Return the scores of a run, and whether it is a whole cloud.
+    """Return the scores of a run, and whether all true trees count, as without a drive.
 
     Raises:
         StemmapError: The run or its ground truth cannot be read, the ground truth has no object within reach
@@ -114,7 +114,7 @@ def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]
     truth = _truth(arguments, finished, number)
     evaluation = score_map(finished.trees, finished.path, truth, parameters)
     if evaluation.TA.of + evaluation.TR.of == 0:
-        nothing = "the ground truth has no trees" if finished.of_cloud else far_truth(evaluation.reach)
+        nothing = far_truth(evaluation.reach) if finished.of_drive else "the ground truth has no trees"
         raise StemmapError(nothing)
     if no_tree := far_map(evaluation, parameters.evaluation.match_distance):
         raise StemmapError(
@@ -122,7 +122,7 @@ def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]
             where=str(folder),
             remedy="Check that the ground truth is in the frame of the map: the first pose is its origin",
         )
-    return evaluation, finished.of_cloud
+    return evaluation, not finished.of_drive
 
 
 def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) -> TruthTrees:
@@ -146,15 +146,15 @@ def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) ->
     file = arguments.files.get(arguments.runs[number])
     if file is not None:
         trees = read_truth_trees(Path(file), dbh_unit=arguments.dbh_unit)
-        if not finished.of_cloud:
+        if finished.of_drive:
             return trees
         return truth_in_metres(trees, crs_unit(finished.record), finished.record["source"]["offset_m"])
     uri = finished.uri
-    if finished.of_cloud:
+    if not finished.of_drive:
         raise StemmapError(
-            "a whole cloud has no true trees",
+            "the source has no true trees",
             where=uri,
-            remedy="Give them with --truth trees.csv, in the coordinates of the cloud",
+            remedy="Give them with --truth trees.csv, in the coordinates of its file",
         )
     with closing(open_source(uri, SourceOptions(seed=finished.seed))) as source:
         truth = source.truth()

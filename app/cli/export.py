@@ -97,8 +97,8 @@ def _tree_manager(arguments: argparse.Namespace, folder: Path) -> int:
         Exit code: 3 if trees far from the path were left out, else 0.
 
     Raises:
-        StemmapError: --out is missing, not empty or cannot be written, the run cannot be read, or it is the
-            map of a whole cloud.
+        StemmapError: --out is missing, not empty or cannot be written, the run cannot be read, or it is no
+            map of a drive.
     """
     from app.batch.run_folder import read_run
     from app.common.text import count
@@ -107,11 +107,11 @@ def _tree_manager(arguments: argparse.Namespace, folder: Path) -> int:
     if arguments.out is None:
         raise UsageError("--out is missing", remedy="Name a folder, or a file with --to trees.gpkg")
     finished = read_run(folder)
-    if finished.of_cloud:
+    if not finished.of_drive:
         raise StemmapError(
-            "this is the map of a whole cloud, which has no poses",
+            "this is no map of a drive: it has no poses",
             where=str(arguments.run),
-            remedy="Use its trees.csv, trees.geojson and slices.csv",
+            remedy="Use its trees.csv and trees.geojson",
         )
     left_out = write_tree_manager(arguments.out, finished.path, finished.trees, arguments.reach)
     frames, trees = count(len(finished.path.x), "frame"), count(len(finished.trees.number), "tree")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.common.text import COMPILING, count
-from pipeline.errors import ParameterError, StemmapError
+from pipeline.errors import ParameterError, SourceError, StemmapError
 
 if TYPE_CHECKING:
     from app.sources.request import SourceRequest
@@ -192,6 +192,15 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
         default="auto",
         help="axis of a whole cloud that points up; --up=-y for -y (auto: by its ground)",
     )
+
+
+def refuse_one_step(arguments: argparse.Namespace) -> None:
+    """Refuse a source that is mapped in one step, which commands for drives cannot use. Raises SourceError
+    that names its extension if that is switched off."""
+    from app.sources.one_step import is_one_step
+
+    if is_one_step(arguments.source, source_request(arguments, arguments.source).options()):
+        raise SourceError("it is no drive", where=arguments.source, remedy="Name another source")
 
 
 def add_live_flags(parser: argparse.ArgumentParser) -> None:

@@ -74,7 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Map a run of scans or a whole cloud; print the result.
+    """Map a run of scans; print the result.
 
     Returns:
         Exit code: 3 if messages or points were left out, else 0.
@@ -88,36 +88,10 @@ def run(arguments: argparse.Namespace) -> int:
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
     from app.batch.run_folder import partial_output_warnings
-    from app.sources.opening import is_cloud
 
     flags.print_warnings(partial_output_warnings(arguments.out))
-    if is_cloud(arguments.source, flags.source_request(arguments, arguments.source).options()):
-        return _run_plot(arguments)
+    flags.refuse_one_step(arguments)
     return _run_scans(arguments)
-
-
-def _run_plot(arguments: argparse.Namespace) -> int:
-    """Map a whole cloud of a plot; return the exit code.
-
-    Raises:
-        StemmapError: The arguments contradict each other, the cloud or --truth cannot be read, or the folder
-            has the map of another source.
-        OSError: The folder cannot be written.
-    """
-    if arguments.continued is not None or arguments.stop_after is not None:
-        raise ParameterError("a whole cloud has no scans", remedy="Remove --continue and --stop-after")
-    from app.batch.map_cloud import map_plot_run
-    from app.batch.run_folder import check_folder
-    from app.sources.opening import open_cloud
-    from pipeline.io.ground_truth import read_truth_trees
-
-    truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
-    name, parameters = flags.chosen_parameters(arguments, "forest")
-    request = flags.source_request(arguments, arguments.source)
-    cloud = open_cloud(arguments.source, request.options())
-    replaces = check_folder(arguments.out, cloud.description.digest, force=arguments.force)
-    outcome = map_plot_run(cloud, name, parameters, truth, arguments.out, request.kept_choices())
-    return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses, replaces=replaces)
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
@@ -139,6 +113,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     from app.worker.numba_warmup import compile_ahead
     from app.worker.run import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
+    from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
+    from pipeline.odometry.lidar_odometry import LOST
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     saved = read_saved_run(arguments.continued) if arguments.continued else None
@@ -199,17 +175,27 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             outcome = map_run(plan, arguments.out, arguments.continued)
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
-    return _tell(
-        [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
+    return tell(
+        [*outcome.summary, times],
+        arguments.out,
+        outcome.warnings,
+        outcome.losses,
+        replaces=replaces,
+        wrong=(DOUBLED, LOST, NOT_FOUND),
     )
 
 
-def _tell(
-    summary: list[str], out: Path, warnings: list[str], losses: dict[str, int], *, replaces: bool
+def tell(
+    summary: list[str],
+    out: Path,
+    warnings: list[str],
+    losses: dict[str, int],
+    *,
+    replaces: bool,
+    wrong: tuple[str, ...] = (),
 ) -> int:
-    """Print the result of a mapping command; return the exit code: 3 with losses, or if the map contradicts
-    itself, the robot or its LiDAR odometry got lost in it, or a cloud is a section through its stems or may
-    have another axis up; else 0.
+    """Print the result of a mapping command; return the exit code: 3 with losses or with a warning
+    that begins with one of `wrong`; else 0.
 
     Args:
         summary: Lines to print.
@@ -217,19 +203,14 @@ def _tell(
         warnings: Messages to print on stderr.
         losses: Number of messages that were left out, by reason.
         replaces: Whether the folder had the files of an earlier run.
+        wrong: First words of warnings after which the map is not as it should be.
     """
-    from pipeline.inventory import SECTION
-    from pipeline.io.readers.up_axis import UP_UNCLEAR
-    from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
-    from pipeline.odometry.lidar_odometry import LOST
-
     for line in summary:
         print(line)
     print(f"files in {out}" + (" (replaced)" if replaces else ""))
     flags.print_warnings(warnings)
     for reason, number in losses.items():
         print(f"left out: {reason} ({number:,})", file=sys.stderr)
-    wrong = (DOUBLED, LOST, NOT_FOUND, SECTION, UP_UNCLEAR)
     return 3 if losses or any(text.startswith(wrong) for text in warnings) else 0
 
 

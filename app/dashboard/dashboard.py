@@ -112,10 +112,10 @@ class Dashboard:
 
     @property
     def offset(self) -> tuple[float, float]:
-        """Offset x, y of the frame of the map in the coordinates of the file of a whole cloud; (0, 0) for a
-        run of scans [m]."""
-        cloud = self.status.cloud
-        return (0.0, 0.0) if cloud is None else cloud.offset[:2]
+        """Offset x, y of the frame of the map in the coordinates of the file of a run of one step; (0, 0) for
+        a run of scans [m]."""
+        one_step = self.status.one_step
+        return (0.0, 0.0) if one_step is None else one_step.offset[:2]
 
     async def start(self, source: protocol.Open, make_scene: Callable[[], Scene]) -> None:
         """Start the worker, which opens a source while the scene is made, and load the saved parameter sets.
@@ -442,7 +442,7 @@ class Dashboard:
             return
         number = self._opens
         if self.shown is None:
-            self.scene.suit(cloud=shown.frame.of_cloud)
+            self.scene.suit(drive=shown.frame.of_drive)
             self.live.publish("view", self.scene.view)
         odometry = np.full((len(shown.path.x), 2), np.nan)
         odometry[: len(shown.odometry_xy)] = shown.odometry_xy

@@ -18,9 +18,10 @@ from app.batch.run_folder import as_written, recorded_time, score_map
 from app.batch.summary import far_truth, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
+from app.sources.one_step import OneStep
 from app.sources.request import SourceRequest
 from app.store.records import Annotation
-from app.worker.protocol import CloudFrame, Shown, Status
+from app.worker.protocol import Shown, Status
 from pipeline.config import Parameters
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import (
@@ -102,14 +103,14 @@ class ShownRun:
         return round(float(np.hypot(np.diff(self.path.x), np.diff(self.path.y)).sum()), 3)
 
     @property
-    def cloud(self) -> CloudFrame | None:
-        """Frame of a whole cloud; None for a run of scans."""
-        return self.status.cloud
+    def one_step(self) -> OneStep | None:
+        """What is known of a source that is mapped in one step; None for a drive."""
+        return self.status.one_step
 
     @property
     def offset(self) -> tuple[float, ...]:
         """Offset of the frame of the map in the coordinates of the files [m]."""
-        return self.cloud.offset if self.cloud else (0.0, 0.0, 0.0)
+        return self.one_step.offset if self.one_step else (0.0, 0.0, 0.0)
 
     def reviews(self) -> dict[int, str]:
         """Return a dict from the number of each confirmed tree that has a review to this review, see
@@ -121,12 +122,12 @@ class ShownRun:
     def trees_text(self) -> str:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
         coordinates of the files."""
-        trees = in_file(self.shown.frame.trees, self.cloud)
+        trees = in_file(self.shown.frame.trees, self.one_step)
         return self._in_units(csv_text(TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())))
 
     def _in_units(self, text: str) -> str:
-        """Return a CSV text with positions in the units of the reference system of the cloud."""
-        return text if self.cloud is None else csv_in_units(text, self.cloud.crs_unit)
+        """Return a CSV text with positions in the units of the reference system of the file."""
+        return text if self.one_step is None else csv_in_units(text, self.one_step.crs_unit)
 
     @contextmanager
     def folder(self) -> Iterator[FilePath]:
@@ -144,7 +145,7 @@ class ShownRun:
         of these files. terrain.csv has only its header if the newest results have no ground."""
         ground, offset = self.shown.frame.ground, self.offset
         cells = [] if ground is None else list(terrain_rows(ground))
-        if self.cloud is not None:
+        if self.one_step is not None:
             cells = [
                 [*(number_text(float(v) + o, 3) for v, o in zip(row, offset, strict=False)), "", ""]
                 for row in cells
@@ -159,45 +160,45 @@ class ShownRun:
 
     def _seen_area(self) -> SeenArea:
         """Return the observed area in the coordinates of the files: what the scans saw, or what the points
-        of a whole cloud cover."""
-        if self.cloud is None:
+        of a source of one step cover."""
+        if self.one_step is None:
             return self.seen.area(self.path)
         counts = self.shown.counts
         covered = np.zeros((0, 2)) if counts is None or counts.covered is None else counts.covered
-        return covered_area(covered + self.cloud.offset[:2])
+        return covered_area(covered + self.one_step.offset[:2])
 
     def _record(self) -> dict[str, Any]:
         """Return the content of run.json as a dict.
 
         The keys are `stemmap` (version); `source`, a dict with `uri`, `kind`, `sha256` ("" if the recording
-        has no digest) and, for a whole cloud, those of `app.batch.map_cloud`; `recorded` and `chosen`
-        where known; `seed`, `odometry`, `preset`, `changed` and `parameters`; `scans` (0 for a whole cloud),
+        has no digest) and, for a source of one step, those of `OneStep`; `recorded` and `chosen`
+        where known; `seed`, `odometry`, `preset`, `changed` and `parameters`; `scans` (0 without a drive),
         `duration_s` and `distance_m`; `trees`, without the rejected ones, and `rejected`, their number;
         `evaluation`, which reviews do not change, None without ground truth; and those of `_counts`."""
-        status, truth = self.status, truth_in_file(self.truth, self.cloud)
-        trees = in_file(self.shown.frame.trees, self.cloud)
+        status, truth = self.status, truth_in_file(self.truth, self.one_step)
+        trees = in_file(self.shown.frame.trees, self.one_step)
         rejected = sum(review == REJECTED for review in self.reviews().values())
         scores = None
         if truth is not None:
             scores = asdict(score_map(*as_written(trees, self.path, self.start_ns), truth, self.parameters))
         digest = "" if self.digest == self.request.uri else self.digest
         source: dict[str, Any] = {"uri": self.request.uri, "kind": status.kind, "sha256": digest}
-        if self.cloud is not None:
-            source |= {"offset_m": list(self.cloud.offset), "crs": self.cloud.crs or None}
-            source |= {"unit": self.cloud.unit, "up": self.cloud.up}
-            if self.cloud.crs_unit != (1.0, 1.0):
-                source["crs_unit_m"] = list(self.cloud.crs_unit)
+        if self.one_step is not None:
+            source |= {"offset_m": list(self.one_step.offset), "crs": self.one_step.crs or None}
+            source |= {"unit": self.one_step.unit, "up": self.one_step.up}
+            if self.one_step.crs_unit != (1.0, 1.0):
+                source["crs_unit_m"] = list(self.one_step.crs_unit)
         return {
             "stemmap": version(),
             "source": source,
-            **({} if self.cloud else recorded_time(status.kind, self.start_ns)),
+            **({} if self.one_step else recorded_time(status.kind, self.start_ns)),
             "seed": self.request.seed,
             "odometry": self.request.odometry,
             **({} if (chosen := self.request.kept_choices()) is None else {"chosen": chosen}),
             "preset": self.preset,
             "changed": changed_values(self.preset, self.parameters),
             "parameters": self.parameters.model_dump(),
-            "scans": 0 if self.cloud else self.shown.frame.index + 1,
+            "scans": 0 if self.one_step else self.shown.frame.index + 1,
             "duration_s": round(self.shown.time_s, 6),
             "distance_m": self.distance_m,
             "trees": int(np.count_nonzero(trees.confirmed)) - rejected,
@@ -207,7 +208,7 @@ class ShownRun:
         }
 
     def _counts(self, scores: dict[str, Any] | None) -> dict[str, Any]:
-        """Return a dict with `health` (not for a whole cloud), `verdicts`, `losses` and `warnings` of
+        """Return a dict with `health` (not without a drive), `verdicts`, `losses` and `warnings` of
         run.json, as `stemmap map` writes them, but `health` has no spans and of the worst values at most
         `sigma_xy_m`; only `warnings`, those of the status, if the counts are unknown.
 
@@ -218,7 +219,7 @@ class ShownRun:
         if counts is None:
             return {"warnings": list(self.status.warnings)}
         warnings = list(counts.warnings)
-        if self.cloud is None:
+        if self.one_step is None:
             if scores is not None and scores["TA"]["of"] + scores["TR"]["of"] == 0:
                 warnings.append(far_truth(scores["reach"]))
             if unconfirmed := unconfirmed_warning(self.shown.frame, self.parameters):
@@ -232,15 +233,15 @@ class ShownRun:
         }
 
 
-def in_file(trees: Trees, cloud: CloudFrame | None) -> Trees:
-    """Return a copy of trees in the coordinates of the file of a whole cloud; for a run of scans (None) the
+def in_file(trees: Trees, one_step: OneStep | None) -> Trees:
+    """Return a copy of trees in the coordinates of the file of a source of one step; for a drive (None) the
     trees themselves."""
-    return trees if cloud is None else replace(trees, position=trees.position + cloud.offset[:2])
+    return trees if one_step is None else replace(trees, position=trees.position + one_step.offset[:2])
 
 
-def truth_in_file(truth: TruthTrees | None, cloud: CloudFrame | None) -> TruthTrees | None:
-    """Return ground truth in the coordinates of the file of a whole cloud; None for None. For a run of scans
-    (no cloud) it is the ground truth itself."""
-    if truth is None or cloud is None:
+def truth_in_file(truth: TruthTrees | None, one_step: OneStep | None) -> TruthTrees | None:
+    """Return ground truth in the coordinates of the file of a source of one step; None for None. For a
+    drive it is the ground truth itself."""
+    if truth is None or one_step is None:
         return truth
-    return replace(truth, x=truth.x + cloud.offset[0], y=truth.y + cloud.offset[1])
+    return replace(truth, x=truth.x + one_step.offset[0], y=truth.y + one_step.offset[1])

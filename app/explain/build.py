@@ -1,6 +1,5 @@
 """Builds the stories: of a cluster from the frame of its scan, of a tree from the shown frame and the voxel
-map, and of the stems of a whole cloud from their cross-sections; and a section at breast height for the 2D
-map."""
+map; and a section at breast height for the 2D map."""
 
 from __future__ import annotations
 
@@ -15,15 +14,13 @@ from app.explain.records import (
     Circle,
     ClusterStory,
     ColumnStory,
-    CrossSection,
     FeatureEffect,
     MapSection,
     TreeStory,
     half_axes,
 )
 from app.store.forests import kept_forests
-from app.worker.inventory_run import InventoryRun
-from pipeline.classification.column_extraction import BREAST
+from app.worker.one_step_run import OneStepRun
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import (
     CLASSES,
@@ -40,9 +37,6 @@ from pipeline.detection.verdicts import Check, checks
 from pipeline.errors import StemmapError
 from pipeline.geometry.columns import evenly_spaced
 from pipeline.geometry.poses import Float
-from pipeline.inventory import PlotMap
-from pipeline.inventory.cross_sections import STEP, THICK, slice_heights
-from pipeline.inventory.stem_model import stem_checks
 from pipeline.types.records import Clusters, Frame, Sensor, Verdict
 
 if TYPE_CHECKING:
@@ -70,7 +64,7 @@ def warm_up(sensor: Sensor) -> None:
 
 
 def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStory:
-    """Return the explanation of a cluster of a recent scan; for a whole cloud see `cloud_cluster_story`.
+    """Return the explanation of a cluster of a recent scan, or of the map of a run of one step.
 
     Args:
         run: The open run, or None.
@@ -82,8 +76,8 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
     """
     if run is None or not 0 <= cluster < len(frame.clusters.size):
         raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
-    if isinstance(run, InventoryRun):
-        return cloud_cluster_story(run, cluster)
+    if isinstance(run, OneStepRun):
+        return run.cluster_story(cluster)
     parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     points = frame.filtered[frame.labels == cluster].astype(np.float64)
@@ -114,19 +108,19 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
 
 
 def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStory:
-    """Return the explanation of a tree after a scan; for a whole cloud see `cloud_tree_story`.
+    """Return the explanation of a tree after a scan, or in the map of a run of one step.
 
     Args:
         run: The open run, or None.
-        frame: Results of the scan, or None; a whole cloud has its own.
+        frame: Results of the scan, or None; a run of one step has its own.
         number: Number of the tree.
 
     Raises:
         StemmapError: No run is open, no scan was mapped, there is no such tree at this time, or the forest in
             force cannot be read.
     """
-    if isinstance(run, InventoryRun):
-        return cloud_tree_story(run, number)
+    if isinstance(run, OneStepRun):
+        return run.tree_story(number)
     rows = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
     if run is None or frame is None or not len(rows):
         raise StemmapError(
@@ -361,8 +355,8 @@ def section(accumulated: NDArray[np.floating]) -> MapSection:
     there. The side of a cell is that of a voxel, doubled until there are at most 20,000 cells.
 
     Args:
-        accumulated: Points of all scans or of a whole cloud: x, y in the map and height above the ground,
-            shape (N, 3) [m].
+        accumulated: Points of all scans, or of a run of one step: x, y in the map and height above the
+            ground, shape (N, 3) [m].
     """
     points = accumulated[_at_breast(accumulated[:, 2]), :2].astype(np.float64)
     origin = np.floor(points.mean(axis=0) if len(points) else np.zeros(2))
@@ -380,83 +374,8 @@ def _at_breast(height: NDArray[np.floating]) -> NDArray[np.bool_]:
     return (height >= BREAST_LOW) & (height < BREAST_HIGH)
 
 
-_SECTION_PICTURES = 9  # cross-sections with points
-_MOST_SECTION_POINTS = 300  # of a cross-section
-_REACH, _MARGIN = (
-    1.6,
-    0.1,
-)  # a picture shows this multiple of the radius, and at least this margin around it [m]
-_UNKNOWN_RADIUS = 0.15  # m, of a candidate without a circle
-
-
-def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
-    """Return the explanation of a tree of a whole cloud.
-
-    Args:
-        run: The cloud.
-        number: Number of the tree.
-
-    Raises:
-        StemmapError: There is no such tree, or the cloud is not mapped yet.
-    """
-    row, plot, frame = run.row_of(number), run.plot, run.frame
-    if plot is None or frame is None:
-        raise StemmapError("the cloud is not mapped yet", remedy="Wait until its stems are shown")
-    trees = frame.trees
-    major, minor, angle = half_axes(trees.covariance[row : row + 1])[0].tolist()
-    candidate = int(plot.tree_candidate[row])
-    return TreeStory(
-        tree=number,
-        scan=0,
-        confirmed=True,
-        position=(float(trees.position[row, 0]), float(trees.position[row, 1])),
-        ellipse=(major, minor, angle),
-        dbh=float(trees.dbh[row]),
-        dbh_sigma=float(trees.dbh_sigma[row]),
-        coverage_deg=float(np.degrees(trees.coverage[row])),
-        dbh_arc_deg=run.parameters_at(0).tracking.dbh_arc_min,
-        observations=int(trees.observations[row]),
-        cluster=candidate,
-        height=float(plot.crowns.height[row]),
-        height_sigma=float(plot.crowns.sigma[row]),
-        height_hidden=plot.crowns.hidden[row],
-        lean_deg=float(np.degrees(trees.lean[row])) if trees.lean is not None else float("nan"),
-        sections=cross_sections(plot, candidate),
-    )
-
-
-def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
-    """Return the explanation of a candidate of a whole cloud; `checks` is empty if no stem was fitted, and
-    `tree` is the number of the tree of this candidate, or None. Fields of a scan keep their defaults.
-
-    Args:
-        run: The cloud.
-        row: Row of the candidate.
-
-    Raises:
-        StemmapError: There is no such candidate, or the cloud is not mapped yet.
-    """
-    plot, frame = run.plot, run.frame
-    if plot is None or frame is None or not 0 <= row < len(plot.verdict):
-        raise StemmapError(f"there is no candidate {row + 1} in the cloud", remedy="Select another")
-    place = plot.place[row]
-    tree = np.flatnonzero(plot.tree_candidate == row)
-    detection = run.parameters_at(0).detection
-    checks = stem_checks(plot.stems, plot.share, detection.radius_min, detection.cloud_radius_max)
-    return ClusterStory(
-        scan=0,
-        cluster=row,
-        verdict=Verdict(int(plot.verdict[row])).label,
-        checks=check_results(checks, row) if np.isfinite(plot.stems["radius"][row]) else [],
-        size=int(frame.clusters.size[row]),
-        position=(float(place[0]), float(place[1])),
-        tree=int(frame.trees.number[tree[0]]) if len(tree) else None,
-        sections=cross_sections(plot, row),
-    )
-
-
 def check_results(checks: Sequence[Check], row: int) -> list[CheckResult]:
-    """Return the checks of the cluster or candidate in `row`, in the order in which they decide. The title is
+    """Return the checks of the cluster in `row`, in the order in which they decide. The title is
     "" for a check whose limit is not a parameter."""
     titles = {spec.name: spec.title for spec in field_specs()}
     return [
@@ -473,57 +392,3 @@ def check_results(checks: Sequence[Check], row: int) -> list[CheckResult]:
         )
         for check in checks
     ]
-
-
-def cross_sections(plot: PlotMap, row: int) -> list[CrossSection]:
-    """Return the cross-sections of a candidate that have a circle, lowest first. At most `_SECTION_PICTURES`
-    of them have points, among them the one nearest to breast height. A candidate without any circle has one
-    section at breast height, with points and the radius NaN.
-
-    Args:
-        plot: The map.
-        row: Row of the candidate.
-    """
-    circles, place, heights = plot.circles[row], plot.place[row], slice_heights()
-    rows = np.flatnonzero(np.isfinite(circles[:, 2]))
-    if not len(rows):
-        points = _points_around(plot, BREAST, place, _UNKNOWN_RADIUS)
-        nan = float("nan")
-        return [CrossSection(BREAST, 0.0, 0.0, nan, nan, 0.0, nan, points)]
-    breast = int(np.argmin(np.abs(heights[rows] - BREAST)))
-    pictures = {*evenly_spaced(len(rows), _SECTION_PICTURES - 1).tolist(), breast}
-    sections = []
-    for k, slab in enumerate(rows.tolist()):
-        circle, height = circles[slab], float(heights[slab])
-        points = _points_around(plot, height, circle[:2], float(circle[2])) if k in pictures else []
-        sections.append(
-            CrossSection(
-                height=round(height, 2),
-                x=round(float(circle[0] - place[0]), 4),
-                y=round(float(circle[1] - place[1]), 4),
-                radius=float(circle[2]),
-                radius_sigma=float(np.sqrt(circle[6])),
-                coverage_deg=float(np.degrees(circle[8])),
-                scatter=float(circle[7]),
-                points=points,
-            )
-        )
-    return sections
-
-
-def _points_around(plot: PlotMap, height: float, centre: Float, radius: float) -> list[tuple[float, float]]:
-    """Return at most _MOST_SECTION_POINTS points of a slice around a circle as (x, y) relative to the centre
-    of the circle [m], rounded to 1 mm. The points are less than _REACH radii, or less than the radius plus
-    _MARGIN if that is more, from the centre.
-
-    Args:
-        plot: The map.
-        height: Middle of the slice above the ground [m].
-        centre, radius: The circle [m].
-    """
-    reach = max(_REACH * radius, radius + _MARGIN)
-    inside = np.abs(plot.points[:, 3] - height) < 0.5 * THICK * STEP
-    offset = plot.points[inside, :2].astype(np.float64) - centre
-    offset = offset[np.hypot(*offset.T) < reach]
-    some = np.round(offset[evenly_spaced(len(offset), _MOST_SECTION_POINTS)], 3)
-    return [(x, y) for x, y in some.tolist()]

@@ -7,6 +7,7 @@ the browser.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -98,28 +99,6 @@ class ColumnStory(msgspec.Struct, frozen=True):
     effects: list[FeatureEffect]
 
 
-class CrossSection(msgspec.Struct, frozen=True):
-    """Horizontal slice through a stem of a whole cloud, with the fitted circle.
-
-    Attributes:
-        height: Height of its middle above the ground [m].
-        x, y: Centre of the circle relative to the axis at breast height [m].
-        radius, radius_sigma: Radius of the circle and its standard deviation [m]; NaN if there is no circle.
-        coverage_deg: Part of the circumference with points on it.
-        scatter: Standard deviation of the points from the circle [m].
-        points: Points relative to the centre of the circle [m]; empty where the section has no picture.
-    """
-
-    height: float
-    x: float
-    y: float
-    radius: float
-    radius_sigma: float
-    coverage_deg: float
-    scatter: float
-    points: list[tuple[float, float]]
-
-
 class ClusterStory(msgspec.Struct, frozen=True):
     """A cluster of one scan.
 
@@ -128,7 +107,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
         time_s: Time of the scan since the first scan of the run [s].
         verdict: Label of the verdict.
         checks: All checks, in the order in which they decide; empty for an external stem, and for a candidate
-            of a whole cloud without a fitted stem.
+            for a stem without a circle.
         size: Number of points of the cluster.
         eccentricity: lambda1 / lambda2.
         position: Position in the frame of the map [m].
@@ -140,10 +119,10 @@ class ClusterStory(msgspec.Struct, frozen=True):
             circle.
         circle: Circle of the cluster; None if the preset fits no circle or the points are too few.
         axes: One standard deviation along the principal axes in the picture: (right, up) of each [m].
-        tree: The nearest confirmed tree within `slam.distance_max`, of a whole cloud the tree of the
-            candidate; None if there is none.
+        tree: The nearest confirmed tree within `slam.distance_max`, or that of the candidate; None if there
+            is none.
         column: Classification of the accumulated scans at the position; None if there is none.
-        sections: Cross-sections of a candidate of a whole cloud; None for a cluster of a scan.
+        further: What an extension tells of it, by its name.
     """
 
     scan: int
@@ -162,7 +141,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
     axes: list[tuple[float, float]] = []
     tree: int | None = None
     column: ColumnStory | None = None
-    sections: list[CrossSection] | None = None
+    further: dict[str, Any] = {}
 
 
 class History(msgspec.Struct, frozen=True):
@@ -212,15 +191,12 @@ class TreeStory(msgspec.Struct, frozen=True):
         observations: Number of scans that detected the tree.
         first_seen_s, last_seen_s: Times of the first and the last detection [s since the first scan].
         cluster: Row of the cluster of the tree in the current scan, see `app.explain.build._cluster_of`, or
-            of its candidate in a whole cloud; None if there is none.
+            of its candidate for a stem; None if there is none.
         column: Classification of the accumulated scans at the position; None if there is none.
         points: Accumulated points around the tree: x, y relative to the position of the tree along the axes
             of the map, and height above the ground [m], see `app.explain.build.points_around`; may be empty.
         history: Estimates in order of time.
-        height, height_sigma: Height of the tree and its standard deviation [m]; NaN if the top is not seen.
-        height_hidden: Reason why the height is unknown; empty if it is known.
-        lean_deg: Angle of the stem from the vertical [deg]; NaN if it is not measured.
-        sections: Cross-sections of a tree of a whole cloud, lowest first; None for a tree of a drive.
+        further: What an extension tells of it, by its name.
     """
 
     tree: int
@@ -242,11 +218,7 @@ class TreeStory(msgspec.Struct, frozen=True):
     column: ColumnStory | None = None
     points: list[tuple[float, float, float]] = []
     history: History = History()
-    height: float = math.nan
-    height_sigma: float = math.nan
-    height_hidden: str = ""
-    lean_deg: float = math.nan
-    sections: list[CrossSection] | None = None
+    further: dict[str, Any] = {}
 
 
 def half_axes(covariance: Float) -> Float:

@@ -30,7 +30,7 @@ from pipeline.types.records import HIDDEN, Frame, HeightMap, Trees, TruthTrees
 Ring = tuple[float, float, float] | None
 
 TREE_HEIGHT = 2.2  # height of a drawn trunk of a drive [m]
-BREAST_HEIGHT = 1.3  # height of a drawn trunk of a whole cloud, where its circle is fitted [m]
+BREAST_HEIGHT = 1.3  # height of a drawn trunk without a drive, where its circle is fitted [m]
 UNKNOWN_RADIUS = 0.08  # radius of a drawn trunk whose diameter is unknown [m]
 
 
@@ -77,7 +77,7 @@ class MapNodes:
         trees, pose = rows_of(frame.trees, frame.trees.confirmed), frame.estimate.T_map_base
         foot = self.ground.heights(trees.position, frame.base_z)
         self._numbers = trees.number.tolist()
-        self._show_trees(trees, np.round(foot, 1), frame.of_cloud, view)
+        self._show_trees(trees, np.round(foot, 1), frame.of_drive, view)
         self._show_mark(trees, selected, ring, frame.base_z)
         robot = np.array([pose.x, pose.y])
         named = view.layers["trees"] and view.layers["labels"]
@@ -118,20 +118,20 @@ class MapNodes:
             self.ground.heights(place, 0.0),
         )
 
-    def _show_trees(self, trees: Trees, foot: Float, of_cloud: bool, view: ViewSettings) -> None:
+    def _show_trees(self, trees: Trees, foot: Float, of_drive: bool, view: ViewSettings) -> None:
         """Send the trunks; those of a whole cloud are as thick as their circles, which are drawn on their
         upper ends.
 
         Args:
             trees: Confirmed trees.
             foot: Height of the ground at each of them, shape (T,) [m].
-            of_cloud: Whether the map is that of a whole cloud.
+            of_drive: Whether the map is of a drive.
             view: Visible layers.
         """
         measured = np.isfinite(trees.dbh)
         place = np.round(trees.position, 2)
         radius: Float = np.where(measured, 0.5 * trees.dbh, UNKNOWN_RADIUS).round(3)
-        height = np.full(len(radius), BREAST_HEIGHT if of_cloud else TREE_HEIGHT)
+        height = np.full(len(radius), TREE_HEIGHT if of_drive else BREAST_HEIGHT)
         each = colours.choose(measured, colours.TREE, colours.UNMEASURED)
         self._trees.show(
             view.layers["trees"],
@@ -139,7 +139,7 @@ class MapNodes:
             np.column_stack([radius, radius, height]),
             each,
         )
-        on = view.layers["fits"] and of_cloud
+        on = view.layers["fits"] and not of_drive
         self._circles.show_at(on, place[measured], radius[measured], each[measured], foot[measured])
 
     def _show_mark(self, trees: Trees, selected: int | None, ring: Ring, base_z: float) -> None:

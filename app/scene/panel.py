@@ -94,10 +94,10 @@ class TunePanel:
         set_value(self._preset, preset_name)
         self._summary.content = _summary(len(changed), preset_name)
 
-    def suit(self, *, cloud: bool) -> None:
-        """Hide the sliders for a whole cloud, whose map does not depend on them."""
+    def suit(self, *, drive: bool) -> None:
+        """Hide the sliders without a drive, whose parameters they are."""
         for folder in self._folders:
-            folder.visible = not cloud
+            folder.visible = drive
 
     def _add_widget(self, gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiSliderHandle[Any]:
         """Add the slider of a parameter, whose changes by people are sent, and return it.

@@ -142,9 +142,9 @@ class BodyNode(Node[viser.MeshHandle]):
         super().__init__(node)
 
     def show(self, frame: Frame) -> None:
-        """Show the part at the pose of a scan; hide it for a whole cloud, which has no robot."""
+        """Show the part at the pose of a scan; hide it without a drive."""
         placed = nodes.placed(self._vertices, frame.estimate.T_map_base, frame.base_z)
-        self.update(not frame.of_cloud, vertices=placed)
+        self.update(frame.of_drive, vertices=placed)
 
 
 HEIGHT = 0.06  # m above the base

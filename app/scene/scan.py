@@ -23,7 +23,8 @@ OnCluster = Callable[[int | None, Vector, Vector], None]
 HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
 SCAN = f"{ROBOT}/scan"
 FILTERED_SIZE, CLUSTER_SIZE = 0.03, 0.045  # diameter of a point of a scan [m]
-CLOUD_SIZES, POINTS_ACROSS = (0.02, 0.1), 700.0  # diameters of a point of a cloud [m]; points across a plot
+# Without a drive: diameters of a point [m], and points across the map.
+POINT_SIZES, POINTS_ACROSS = (0.02, 0.1), 700.0
 WIDEST_MARKER = 0.6  # [m], the radius of a thick trunk
 
 
@@ -50,7 +51,7 @@ class ScanNodes:
             _report(batch, self._markers, on_cluster)
 
     def show(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
-        """Show a scan. For a whole cloud, points of clusters are not shown as filtered points, and clusters
+        """Show a scan. Without a drive, points of clusters are not shown as filtered points, and clusters
         have neither labels nor fitted circles.
 
         Args:
@@ -62,10 +63,10 @@ class ScanNodes:
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
         numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
         raw, filtered = nodes.scan_in_map(frame, frame.raw), nodes.scan_in_map(frame, frame.filtered)
-        size = cloud_point_size(frame) if frame.of_cloud else None
+        size = None if frame.of_drive else point_size(frame)
         self._raw.show(layers["raw"], raw, self._ramp_or(frame.raw, view, colours.RAW, ends))
-        # The points of the trees of a cloud are those of the clusters, and are not drawn twice.
-        rest = frame.labels < 0 if frame.of_cloud else slice(None)
+        # The points of the trees without a drive are those of the clusters, and are not drawn twice.
+        rest = slice(None) if frame.of_drive else frame.labels < 0
         self._filtered.show(
             layers["filtered"],
             filtered[rest],
@@ -81,7 +82,7 @@ class ScanNodes:
         )
         self._show_fits(frame, layers["fits"])
         self._show_markers(frame, layers["clusters"])
-        named = layers["labels"] and not frame.of_cloud  # the trees have labels; others are too many
+        named = layers["labels"] and frame.of_drive  # the trees have labels; others are too many
         self._labels.show(cluster_labels(frame, numbers, view.label_by, labelled) if named else [])
 
     def meant(self, instance: int | None, origin: Float, direction: Float) -> int | None:
@@ -112,9 +113,9 @@ class ScanNodes:
         return plain
 
     def _show_fits(self, frame: Frame, on: bool) -> None:
-        """Show a cylinder for each detected stem with a fitted circle; none for a whole cloud, whose circles
+        """Show a cylinder for each detected stem with a fitted circle; none without a drive, where circles
         are those of its trees."""
-        rows = frame.detections.cluster if not frame.of_cloud else np.zeros(0, np.int64)
+        rows = frame.detections.cluster if frame.of_drive else np.zeros(0, np.int64)
         rows = rows[np.isfinite(frame.clusters.radius[rows])]
         clusters = frame.clusters
         height = shown_height(clusters.extent[rows, 2])
@@ -141,7 +142,7 @@ class ScanNodes:
         foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
         low = nodes.scan_in_map(frame, foot).astype(np.float64)
         size = np.column_stack([radius, radius, height])
-        if frame.of_cloud:  # candidates without a circle are many
+        if not frame.of_drive:  # candidates without a circle are many
             size[np.isnan(c.radius)] = 0.0
         self._markers.show(on, low, size, colours.by_verdict(c.verdict))
         self._axes = (low, low + np.column_stack([np.zeros((len(height), 2)), height]), radius)
@@ -164,10 +165,10 @@ def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
         on_cluster(instance, event.ray_origin, event.ray_direction)
 
 
-def cloud_point_size(frame: Frame) -> float:
-    """Return the diameter of the points of a whole cloud [m]; it grows with the width of the plot within
-    CLOUD_SIZES."""
-    return float(np.clip(extent(frame) / POINTS_ACROSS, *CLOUD_SIZES))
+def point_size(frame: Frame) -> float:
+    """Return the diameter of the points without a drive [m]; it grows with the width of the plot within
+    POINT_SIZES."""
+    return float(np.clip(extent(frame) / POINTS_ACROSS, *POINT_SIZES))
 
 
 def extent(frame: Frame) -> float:
@@ -178,9 +179,9 @@ def extent(frame: Frame) -> float:
 
 def height_range(frame: Frame) -> tuple[float, float]:
     """Return the lower and upper end of the colour ramp, heights in the level frame of the sensor [m]:
-    HEIGHT_LOW and HEIGHT_HIGH for a scan and for a cloud without points; the percentiles 1 and 99 of the
-    filtered points for a whole cloud."""
-    if not frame.of_cloud or not len(frame.filtered):
+    HEIGHT_LOW and HEIGHT_HIGH for a scan and for a map without points; the percentiles 1 and 99 of the
+    filtered points without a drive."""
+    if frame.of_drive or not len(frame.filtered):
         return HEIGHT_LOW, HEIGHT_HIGH
     low, high = np.percentile(frame.filtered[:, 2], (1.0, 99.0))
     return float(low), float(high)

@@ -80,7 +80,7 @@ class Scene:
         first = self._frame is None
         self._frame, self._path = frame, path
         if first:
-            self._follower.frame_plot(extent(frame) if frame.of_cloud else 0.0)
+            self._follower.frame_plot(0.0 if frame.of_drive else extent(frame))
         self._accumulated.take(frame)
         if self.messages > RENEW_AFTER:
             self._renew()
@@ -121,14 +121,14 @@ class Scene:
         self._draw()
         return None if self._frame is None else self._map.place_of(self._frame, tree, ring)
 
-    def suit(self, *, cloud: bool) -> None:
-        """Choose how points are coloured when a run begins: a whole cloud by height, a scan by verdict. Other
-        choices of a person stay. The sliders are hidden for a whole cloud, which does not depend on them. The
-        shown scan is not drawn again."""
-        self._tune.suit(cloud=cloud)
+    def suit(self, *, drive: bool) -> None:
+        """Choose how points are coloured when a run begins: the scans of a drive by verdict, else by height.
+        Other choices of a person stay. The sliders are hidden without a drive, whose parameters they are.
+        The shown scan is not drawn again."""
+        self._tune.suit(drive=drive)
         usual = COLOUR_BY[0]
         if self._view.colour_by in (usual, "height"):
-            self._view.colour_by = "height" if cloud else usual
+            self._view.colour_by = usual if drive else "height"
 
     @property
     def view(self) -> dict[str, Any]:
@@ -242,7 +242,7 @@ class Scene:
             return
         parameters = self._parameters
         with self._server.atomic():  # otherwise the points would move before the robot
-            self._grid.visible = not frame.of_cloud  # its zero is far below or above the plot
+            self._grid.visible = frame.of_drive  # its zero is far below or above the plot
             self._follower.show(self._pose, self._base_z, self._view.follow)
             # First, because the other nodes use the heights of its ground.
             self._map.show(frame, self._selected, self._ring, self._view)

@@ -21,7 +21,8 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
-from app.sources.opening import MEMORY_LIMIT, is_cloud, open_cloud, open_source
+from app.sources.one_step import is_one_step, open_one_step
+from app.sources.opening import MEMORY_LIMIT, open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
 from app.sources.topic_details import topic_details
 from pipeline.errors import SourceError
@@ -33,8 +34,7 @@ HYPOTHESES = 1_000_000
 
 
 def recording(question: dict[str, Any]) -> dict[str, Any]:
-    """Return {"kind": format} of a recording, detected from its contents; that of a whole cloud begins with
-    "whole cloud, ".
+    """Return {"kind": format} of a recording, detected from its contents.
 
     Args:
         question: The key "path" has the path.
@@ -42,9 +42,8 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
     Raises:
         SourceError: The recording cannot be read.
     """
-    if is_cloud(question["path"]):
-        return {"kind": f"whole cloud, {open_cloud(question['path']).description.kind}"}
-    with closing(open_source(question["path"])) as source:
+    path = question["path"]
+    with closing(open_one_step(path) or open_source(path)) as source:
         return {"kind": source.description.kind}
 
 
@@ -226,10 +225,10 @@ def recorded(uri: str) -> dict[str, Any]:
     20 strings, with what is missing.
 
     Raises:
-        SourceError: The source cannot be read, or is a whole cloud.
+        SourceError: The source cannot be read, or is no drive.
     """
-    if is_cloud(uri):
-        raise SourceError("a whole cloud has no topics", where=uri, remedy="Open it as it is")
+    if is_one_step(uri):
+        raise SourceError("it has no topics", where=uri, remedy="Open it as it is")
     with closing(open_source(uri)) as source:
         about = source.description
         known = about.start_ns is not None and about.end_ns is not None

@@ -29,6 +29,7 @@ import msgspec
 from app.common.child_process import ChildError, ChildProcess, ProtocolError, python_module
 from app.extension import extensions_on
 from app.robot.address import is_live, parse_address
+from app.sources.one_step import check_one_step
 from app.sources.request import SourceRequest
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import (
@@ -340,8 +341,8 @@ async def ask(
 
 async def check_source(request: SourceRequest) -> None:
     """Check that a source can be opened. Of a recording, a child process reads the first scan, within
-    OPENING_LIMIT_S. Of a whole cloud, it reads the header and the first points; on systems other than Linux,
-    only the existence of the file is checked. Of simulated runs and live robots, only the address is checked.
+    OPENING_LIMIT_S. A source that is mapped in one step is checked by its extension. Of simulated runs and
+    live robots, only the address is checked.
 
     Raises:
         StemmapError: The source cannot be opened or takes too long; the error gives the reason.
@@ -349,8 +350,6 @@ async def check_source(request: SourceRequest) -> None:
     if not check_address(request.uri):
         return
     options = request.options()
-    if await asyncio.to_thread(is_cloud, request.uri, options):
-        await asyncio.to_thread(check_cloud, request.uri, options)  # a copy of this process: starts at once
-    else:
+    if not await asyncio.to_thread(check_one_step, request.uri, options):
         question = {"ask": "first_scan", "path": request.uri, "request": msgspec.to_builtins(request)}
         await ask(question, patience_s=OPENING_LIMIT_S)

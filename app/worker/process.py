@@ -17,7 +17,6 @@ from typing import BinaryIO
 from app.common.child_process import private_streams
 from app.common.text import COMPILING
 from app.robot.source import LiveSource
-from app.worker.inventory_run import CloudSource
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import Outbox, RecentScans
 from app.worker.protocol import ToWorker, WireError, to_worker
@@ -39,7 +38,7 @@ def new_session() -> Session:
     from app.worker.numba_warmup import compile_ahead, warm_up
 
     return Session(
-        open_source=open_any_or_cloud,
+        open_source=open_any_or_one_step,
         make_mapper=mapper_of,
         parameters=Parameters(),
         compile_ahead=compile_ahead,
@@ -47,18 +46,17 @@ def new_session() -> Session:
     )
 
 
-def open_any_or_cloud(uri: str, options: SourceOptions) -> Source | LiveSource:
-    """Open a source by its URI: a file with a whole cloud to be mapped as a whole; else as `open_any`. A
-    drive through a cloud has the URI sim:cloud?file=PATH.
+def open_any_or_one_step(uri: str, options: SourceOptions) -> Source | LiveSource:
+    """Open a source by its URI: one that is mapped in one step, else as `open_any`.
 
     Raises:
-        SourceError: The source does not exist, has an unknown format, or is damaged.
+        SourceError: The source does not exist, has an unknown format, or is damaged, or its extension is
+            switched off.
     """
     from app.robot.source import open_any
-    from app.sources.opening import is_cloud, open_cloud
+    from app.sources.one_step import open_one_step
 
-    path = path_of(uri)
-    return CloudSource(open_cloud(path, options)) if is_cloud(path, options) else open_any(uri, options)
+    return open_one_step(path_of(uri), options) or open_any(uri, options)
 
 
 def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:

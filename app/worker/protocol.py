@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from app.explain.records import ClusterStory, MapSection, TreeStory
+from app.sources.one_step import OneStep
 from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 from pipeline.io.readers.camera import Camera, Picture
@@ -27,29 +28,6 @@ MOST_SCANS = 10**9
 FASTEST = 1000.0
 
 State = Literal["starting", "playing", "paused", "finished", "waiting", "failed"]
-
-
-@dataclass(frozen=True, slots=True)
-class CloudFrame:
-    """Frame of a whole cloud.
-
-    Attributes:
-        offset: Offset x, y, z of the frame of the map in the coordinates of the file [m].
-        crs: Coordinate reference system of the file, in metres; "" if unknown.
-        points: Number of points of the file.
-        parameters: Dotted names of the parameters that change the map.
-        crs_unit: Metres per unit of the reference system in which positions are written, horizontal and
-            vertical.
-        unit, up: Unit of the coordinates of the file and its axis that points up, for people.
-    """
-
-    offset: tuple[float, float, float]
-    crs: str
-    points: int
-    parameters: list[str]
-    crs_unit: tuple[float, float] = (1.0, 1.0)
-    unit: str = "metres"
-    up: str = "z"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +64,7 @@ class Status:
             no rerun.
         camera: Whether the source has camera pictures.
         recording: State of the recording of a live run; empty if there is none.
-        cloud: Frame of a whole cloud whose stems are mapped; None for a run of scans.
+        one_step: What is known of a source that is mapped in one step; None for a run of scans.
     """
 
     state: State
@@ -118,7 +96,7 @@ class Status:
     camera: bool = False
     remapped: float | None = None
     compiling_since_s: float | None = None
-    cloud: CloudFrame | None = None
+    one_step: OneStep | None = None
     compiled: float | None = None
 
 
@@ -214,16 +192,17 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
 
 
 class RunCounts(msgspec.Struct, frozen=True):
-    """Counts of a run up to a scan, as in run.json, or of a whole cloud, with the cells that it covers.
+    """Counts of a run up to a scan, as in run.json.
 
     Attributes:
         health: Dict from the states of the pose quality ("good", "weak", "lost") to numbers of scans; empty
-            for a whole cloud.
+            for a run of one step.
         sigma_xy_m: Maximum standard deviation of the position [m]; None if unknown.
         verdicts: Dict from verdicts to numbers of clusters.
         losses: Dict from reasons to numbers of messages or points that were left out.
         warnings: Warnings as strings, each once, with the number of its occurrences if it is more than 1.
-        covered: Centres of the cells that a whole cloud covers, shape (K, 2) [m]; None for a run of scans.
+        covered: Centres of the cells that a source of one step covers, shape (K, 2) [m]; None for a run of
+            scans.
     """
 
     health: dict[str, int] = {}

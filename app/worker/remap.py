@@ -577,7 +577,7 @@ def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: i
 
 def _why_not(frame: Frame, place: Float) -> str:
     """Return the reason why a map has no confirmed tree at a position, as text: the class of the nearest
-    column unless it is a tree; for a whole cloud, the verdict of the nearest candidate; else the number of
+    column unless it is a tree; without a drive, the verdict of the nearest candidate; else the number of
     observations of the nearest tree, or that nothing was detected. Only columns, candidates and trees within
     SAME count.
 
@@ -591,7 +591,7 @@ def _why_not(frame: Frame, place: Float) -> str:
             reason = _column(frame.columns, near)
             if reason:
                 return reason
-    if frame.of_cloud:
+    if not frame.of_drive:
         near = _nearest(frame.estimate.T_map_base.apply(frame.clusters.centre), place)
         if near >= 0:
             return f"the candidate there is {Verdict(int(frame.clusters.verdict[near])).label!r}"

@@ -18,11 +18,11 @@ from app.batch.tree_pictures import best_views
 from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
-from app.worker.inventory_run import CloudSource, InventoryRun
+from app.sources.one_step import OneStepSource
+from app.worker.one_step_run import OneStepRun
 from app.worker.protocol import (
     LONGEST_S,
     CameraPicture,
-    CloudFrame,
     MapChanges,
     Open,
     Opened,
@@ -35,7 +35,6 @@ from app.worker.remap import MapComparison
 from app.worker.run import MakeMapper, Run
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
-from pipeline.inventory import PARAMETERS
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SHOWN_NS, PictureSource
 from pipeline.io.readers.topics import COMPRESSED_IMAGE, IMAGE
@@ -44,7 +43,7 @@ from pipeline.types.records import Float, Frame, Path, Trees
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
 Pace = Literal["idle", "replay", "hurry", "live"]
-AnyRun = Run | InventoryRun
+AnyRun = Run | OneStepRun
 
 _NS = 1_000_000_000
 _MOST_WARNINGS = 20
@@ -152,7 +151,7 @@ class Session:
 
     @property
     def run(self) -> AnyRun | None:
-        """The open run or whole cloud, or None."""
+        """The open run, or None."""
         return self._run
 
     def next_ns(self) -> int | None:
@@ -215,8 +214,8 @@ class Session:
         """
         run: AnyRun
         try:
-            if isinstance(source, CloudSource):
-                run = InventoryRun(source, self._parameters)
+            if isinstance(source, OneStepSource):
+                run = OneStepRun(source, self._parameters)
             else:
                 run = Run(source, request, self._parameters, self._make_mapper)
         except BaseException:
@@ -228,7 +227,7 @@ class Session:
 
     def prepare(self) -> None:
         """Compile the kernels by mapping the first scan, whose result is discarded. It can take minutes the
-        first time on a machine. Nothing without a run, and for a whole cloud.
+        first time on a machine. Nothing without a run, and for one of one step.
 
         Raises:
             SourceError: There is no scan, or it cannot be read.
@@ -250,8 +249,8 @@ class Session:
         frame may have no points (`Run.is_bare`); the seek ends at its target or at the end of the run. The
         results of a live robot are published and recorded.
 
-        None if no run is open, if `pace` is "idle", while a whole cloud is not mapped completely, before a
-        live scan arrived, and at the end of a run without a seek. The state becomes "finished" when no scan
+        None if no run is open, if `pace` is "idle", while a run of one step is not mapped completely, before
+        a live scan arrived, and at the end of a run without a seek. The state becomes "finished" when no scan
         is left, unless the run is live; also in a seek, which then returns the last scan.
 
         Raises:
@@ -264,7 +263,7 @@ class Session:
         if self._target.is_at_end(run):
             return self._arrive(run)
         frame = run.map_next(hurried=self._target.sought)
-        if isinstance(run, InventoryRun) and run.share is not None:
+        if isinstance(run, OneStepRun) and run.share is not None:
             return None
         if frame is None:
             self._state = "finished" if self._robot is None else self._state
@@ -535,8 +534,8 @@ def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | Non
     description = run.source.description
     losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
     distance_m = 0.0 if path is None else round(driven(path)[1], 3)
-    if isinstance(run, InventoryRun):
-        status = _with_cloud(status, run)
+    if isinstance(run, OneStepRun):
+        status = _with_one_step(status, run)
     return replace(
         status,
         kind=description.kind,
@@ -555,22 +554,12 @@ def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | Non
     )
 
 
-def _with_cloud(status: Status, run: InventoryRun) -> Status:
-    """Return the status of a whole cloud: its frame, and the progress of its first map."""
-    about = run.about
-    cloud = CloudFrame(
-        tuple(about.offset.tolist()),
-        about.crs,
-        about.points,
-        list(PARAMETERS),
-        about.crs_unit,
-        about.unit,
-        about.up,
-    )
+def _with_one_step(status: Status, run: OneStepRun) -> Status:
+    """Return the status of a run of one step, with the progress of its first map."""
+    status = replace(status, one_step=run.source.about)
     if run.frame is None and run.share is not None and status.state in ("playing", "paused"):
-        detail = f"Mapping the cloud: {100.0 * run.share:.0f} %"
-        return replace(status, cloud=cloud, state="starting", detail=detail)
-    return replace(status, cloud=cloud)
+        return replace(status, state="starting", detail=f"Mapping: {100.0 * run.share:.0f} %")
+    return status
 
 
 def opened_of(run: AnyRun) -> Opened:
@@ -715,7 +704,7 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     return CameraPicture(picture, *origin.camera(), received)
 
 
-def tree_picture(run: Run | InventoryRun | None, number: int) -> CameraPicture:
+def tree_picture(run: AnyRun | None, number: int) -> CameraPicture:
     """Return the camera picture of a run that shows a tree best, see `best_views`, with its camera model.
 
     Of a recording, the pictures nearest to the mapped scans are considered, because a list of all pictures

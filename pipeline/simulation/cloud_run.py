@@ -20,8 +20,8 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.inventory import finish, ground_steps
-from pipeline.inventory.terrain_raster import TerrainRaster
+from pipeline.ground.plot_ground import finish, ground_steps
+from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.jit import compiled
 from pipeline.simulation import run as simulated
 from pipeline.simulation.lidar import SpinningLidar, Sweep, scan_of_returns

@@ -692,14 +692,14 @@ class Frame:
             the level base frame.
         trees: The map.
         counts: Dict from names such as "out of range", "clustered" and "noise" to numbers of points that a
-            stage passed or rejected; the names differ for stems and whole clouds.
+            stage passed or rejected; the names differ for stems and without a drive.
         warnings: Messages for the user.
         columns: Voxel columns; None without this classifier.
         ground: Terrain map, updated every few scans; None without ground segmentation, or if it is unchanged.
         base_z: Height of the base in the terrain map [m].
         clearance: Free distance on the path of the robot; None without obstacle detection.
-        of_cloud: Whether it is the map of a whole cloud: there is no robot, and the pose is the middle of the
-            plot.
+        of_drive: Whether it is of the drive of a robot; else it is the map of a source as a whole, there is
+            no robot, and the pose is the middle of the map.
     """
 
     index: int
@@ -719,7 +719,7 @@ class Frame:
     ground: HeightMap | None = None
     base_z: float = 0.0
     clearance: Clearance | None = None
-    of_cloud: bool = False
+    of_drive: bool = True
 
     @property
     def health(self) -> Health:

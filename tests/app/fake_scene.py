@@ -48,8 +48,8 @@ class FakeScene(Scene):
             raise ParameterError("there is no such layer")
         self.calls.append(("choose", (name, value)))
 
-    def suit(self, *, cloud: bool) -> None:
-        self.calls.append(("suit", cloud))
+    def suit(self, *, drive: bool) -> None:
+        self.calls.append(("suit", drive))
 
     def clear(self) -> None:
         self.calls.append(("clear", None))

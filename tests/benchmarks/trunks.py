@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from app.common.timers import Stopwatch
+from app.extensions.clouds.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from app.extensions.learning.examples import SUFFIX, Examples, read_examples
 from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
 from pipeline.config import preset
 from pipeline.evaluation import evaluate, match
-from pipeline.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from pipeline.io.readers import open_source
 from pipeline.io.readers.base import SourceOptions
 from pipeline.io.readers.simulated import SimulatedSource

@@ -15,7 +15,7 @@ import numpy as np
 
 from app.common.text import version
 from app.robot.source import LiveSource, open_any
-from app.sources.opening import is_cloud
+from app.sources.one_step import is_one_step
 from app.sources.request import SourceRequest, with_odometry
 from app.store.records import Content
 from app.store.store import AnnotatedSource
@@ -250,7 +250,7 @@ def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Exa
         progress: Called with a progress message every 50 scans while the run is mapped.
 
     Raises:
-        SourceError: The run cannot be read, is live or a whole cloud, or is another recording.
+        SourceError: The run cannot be read, is live or no drive, or is another recording.
         StemmapError: The stored examples are damaged, or the examples cannot be written.
         OSError: The folder cannot be created.
     """
@@ -283,11 +283,11 @@ def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
         progress: Called with a progress message every 50 scans.
 
     Raises:
-        SourceError: The run cannot be read, is live or a whole cloud, or is another recording.
+        SourceError: The run cannot be read, is live or no drive, or is another recording.
     """
     request = run.request
-    if is_cloud(request.uri, request.options()):
-        what = "a whole cloud has no scans to learn from"
+    if is_one_step(request.uri, request.options()):
+        what = "it has no scans to learn from"
         raise SourceError(what, where=request.uri, remedy="Annotate a drive")
     with closing(open_any(request.uri, request.options())) as source:
         if isinstance(source, LiveSource):

@@ -100,7 +100,7 @@ class JobResult(msgspec.Struct, frozen=True):
 
     Attributes:
         scores: Scores of the map; None after a failure.
-        scans, trees: Number of scans (0 for a whole cloud), and of confirmed trees in the map.
+        scans, trees: Number of scans (0 without a drive), and of confirmed trees in the map.
         seconds: Computing time [s].
         looked: Whether the front end ran; False if its cached results were used.
         error: Reason of the failure.

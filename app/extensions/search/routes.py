@@ -36,7 +36,7 @@ Curve = Annotated[Sensitivity, of_app("sensitivity")]
 
 def run_with_truth(dashboard: Dashboard) -> RunWithTruth:
     """Return the open run for a search or a sensitivity curve, see `RunWithTruth.shown` for errors."""
-    truth = truth_in_file(dashboard.truth, dashboard.status.cloud)
+    truth = truth_in_file(dashboard.truth, dashboard.status.one_step)
     return RunWithTruth.shown(dashboard.source, dashboard.digest, truth)
 
 

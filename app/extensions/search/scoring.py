@@ -23,15 +23,15 @@ from app.common.child_process import ParentConnection, run_child
 from app.dashboard.annotations import laid_over
 from app.extensions.search.jobs import Job, JobResult, RunWithTruth
 from app.extensions.search.plan import PlannedRun
-from app.sources.opening import is_cloud
+from app.sources.one_step import OneStepSource, open_one_step
 from app.sources.request import SourceRequest, request_of_kept, with_odometry
 from app.store.forests import kept_forests, mapper_of
 from app.store.records import as_truth, contents_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import SourceError, StemmapError
+from pipeline.ground.plot_ground import finish
 from pipeline.io.readers import open_source
-from pipeline.io.readers.clouds import open_cloud
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping.rerun import ScanCache, ScanCaches
@@ -47,10 +47,10 @@ class MappedRun:
 
     Attributes:
         trees: The confirmed trees.
-        path: One row per scan; empty for a whole cloud.
-        scans: Number of scans; 0 for a whole cloud.
-        front_end_ran: Whether the front end ran; False where its cached results were used. True for a whole
-            cloud.
+        path: One row per scan; empty without a drive.
+        scans: Number of scans; 0 without a drive.
+        front_end_ran: Whether the front end ran; False where its cached results were used. True without a
+            drive.
     """
 
     trees: Trees
@@ -153,41 +153,39 @@ class OpenDrive:
         return steps(self._source.records(), odometry=self._odometry.steps)
 
 
-class OpenCloud:
-    """A whole cloud of a plot, with the methods of `OpenDrive`. It has no path and no true trees of its own.
-    Because it has no path, all true trees that are given count.
+class OpenOneStep:
+    """A source that is mapped in one step, with the methods of `OpenDrive`. It has no path and no true trees
+    of its own. Because it has no path, all true trees that are given count.
 
-    Raises:
-        StemmapError: The cloud cannot be read.
+    Args:
+        source: The source.
     """
 
     own_truth: TruthTrees | None = None
     preset = "forest"
 
-    def __init__(self, source: SourceRequest) -> None:
-        self._uri, self._options = source.uri, source.options()
-        self.digest = self.recording_digest = open_cloud(self._uri, self._options).description.digest
+    def __init__(self, source: OneStepSource) -> None:
+        self._source = source
+        self.digest = self.recording_digest = source.description.digest
 
     def map(self, parameters: Parameters) -> MappedRun:
-        """Map the cloud with these parameters, as `stemmap map` does. The file is read at each call.
-        Positions are in the frame of the file; `path` is empty and `scans` is 0.
+        """Map the source with these parameters, as `stemmap map` does. Positions are in the frame of the
+        file; `path` is empty and `scans` is 0.
 
         Raises:
-            StemmapError: The cloud cannot be read or mapped.
+            StemmapError: The source cannot be read or mapped.
         """
-        from pipeline.inventory import map_plot
-
-        cloud = open_cloud(self._uri, self._options)
-        found = map_plot(cloud, parameters, kept_forests()).trees
-        placed = replace(found, position=found.position + cloud.description.offset[:2])
+        found = finish(self._source.steps(parameters)).frame.trees
+        placed = replace(found, position=found.position + self._source.about.offset[:2])
         trees, path = as_written(placed, NO_PATH, 0)
         return MappedRun(trees, path, 0, True)
 
     def close(self) -> None:
-        """Do nothing: no file is open."""
+        """Close the source."""
+        self._source.close()
 
 
-OpenRun = OpenDrive | OpenCloud
+OpenRun = OpenDrive | OpenOneStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +209,8 @@ def open_run(source: SourceRequest) -> OpenRun:
     Raises:
         StemmapError: The source cannot be read.
     """
-    return OpenCloud(source) if is_cloud(source.uri, source.options()) else OpenDrive(source)
+    one_step = open_one_step(source.uri, source.options())
+    return OpenDrive(source) if one_step is None else OpenOneStep(one_step)
 
 
 def prepare_run(planned: PlannedRun) -> PreparedRun:

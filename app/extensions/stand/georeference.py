@@ -314,7 +314,7 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
 
     Raises:
         StemmapError: The run, its recording or its saved state cannot be read, the recording has no fixes (as
-            that of a live run or a whole cloud), or they are not in the area of the reference system or do
+            that of a live run), or they are not in the area of the reference system or do
             not fit the path.
     """
     from app.batch.continue_map import read_saved_run
@@ -325,7 +325,7 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
 
     run = read_run(folder)
     fixes = []
-    if not (run.of_cloud or is_live(run.uri)):
+    if run.of_drive and not is_live(run.uri):
         with closing(open_source(run.uri)) as source:
             fixes = source.fixes() if isinstance(source, RosSource) else []
     if not fixes:

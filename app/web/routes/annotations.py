@@ -117,8 +117,8 @@ async def import_table(body: _Import, dashboard: Dash) -> Response:
     that exist already as annotations or earlier in the table (`left_out`), and the counts of edits, see
     `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows, 409 as in `add`; then
     nothing is added. Without new rows there is no edit."""
-    cloud = dashboard.status.cloud
-    unit = (1.0, 1.0) if cloud is None else cloud.crs_unit
+    one_step = dashboard.status.one_step
+    unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
     contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new: dict[tuple[float, float, str], Content] = {}
@@ -140,8 +140,8 @@ async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
 
 @router.get("/annotations.csv")
 async def export_table(dashboard: Dash) -> Response:
-    """Return the annotations as a CSV table for the import and for `stemmap evaluate`, those of a whole cloud
-    in its coordinates; only its header without annotations."""
+    """Return the annotations as a CSV table for the import and for `stemmap evaluate`, those of a run of one
+    step in the coordinates of its file; only the header without annotations."""
     from pipeline.io.result_files import csv_text
 
     return text_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
@@ -150,22 +150,25 @@ async def export_table(dashboard: Dash) -> Response:
 @router.get("/annotations.geojson")
 async def export_geojson(dashboard: Dash) -> Response:
     """Return the annotations as a FeatureCollection of points in the frame of the map, or of the file of a
-    whole cloud, which it declares, with class, DBH [cm], author and time; no features without annotations."""
+    run of one step, which it declares, with class, DBH [cm], author and time; no features without
+    annotations."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
-    cloud = dashboard.status.cloud is not None
+    frame = dict(ROBOTS_FRAME)
+    if dashboard.status.one_step is not None:
+        frame["origin"] = "that of the file"
     features = [_feature(row) for row in _rows(dashboard)]
     collection = {
         "type": "FeatureCollection",
-        "coordinateFrame": {**ROBOTS_FRAME, "origin": "that of the cloud"} if cloud else dict(ROBOTS_FRAME),
+        "coordinateFrame": frame,
         "features": features,
     }
     return text_reply(json.dumps(collection, indent=1) + "\n", "truth.geojson", "application/geo+json")
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
-    """Return the annotations of objects of the open run as dicts, see `row_payload`; for a whole cloud, in
-    the coordinates of the file."""
+    """Return the annotations of objects of the open run as dicts, see `row_payload`; for a run of one
+    step, in the coordinates of its file."""
     x, y = dashboard.offset
     rows = [row_payload(row) for row in dashboard.annotation_editor.rows]
     return [{**row, "x": row["x"] + x, "y": row["y"] + y} for row in rows]
@@ -214,7 +217,7 @@ def _imported(
     body: _Import, offset: tuple[float, float], unit: tuple[float, float] = (1.0, 1.0)
 ) -> list[Content]:
     """Return the rows of an imported table in the frame of the map; raises BadRequestError if it cannot be
-    read, or a row or their number is out of bounds. A table of a cloud in feet may be in feet or in metres,
+    read, or a row or their number is out of bounds. A table of a file in feet may be in feet or in metres,
     see `truth_in_metres`.
 
     Args:

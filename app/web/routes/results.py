@@ -82,7 +82,7 @@ async def trees(dashboard: Dash) -> Response:
 
 @router.get("/trees.csv")
 def trees_table(dashboard: Dash) -> Response:
-    """Return the confirmed trees with their reviews as a CSV table, those of a whole cloud in its
+    """Return the confirmed trees with their reviews as a CSV table, those of a run of one step in its
     coordinates; only the header before the first map."""
     from pipeline.io.result_files import TREE_COLUMNS, csv_text
 

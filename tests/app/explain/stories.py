@@ -81,7 +81,5 @@ def tree_story(number: int) -> TreeStory:
         column=None,
         points=[(0.15, 0.0, 1.3)],
         history=History([0.5], [1.0], [2.0], [0.02], [0.01], [0.3], [0.3], [0.01]),
-        height=14.0,
-        height_sigma=0.3,
-        lean_deg=1.5,
+        further={"lines": {"height": 14.0}},
     )

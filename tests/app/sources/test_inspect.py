@@ -34,7 +34,7 @@ from tests.app.batch.finished_runs import grid_run
 from tests.app.fakes import FakeSource, FakeWorker, make_mapper
 from tests.app.robot.conftest import clouds
 from tests.app.server_for_tests import BEARER, Running, running
-from tests.pipeline.inventory.plots import write_las
+from tests.pipeline.plots import write_las
 
 MOUNT = (0.1, 0.2, 0.9, 5.0, -3.0, 90.0)
 

@@ -17,6 +17,7 @@ import pytest
 
 from app.common.settings import Files, Settings
 from app.dashboard.dashboard import Dashboard
+from app.sources.one_step import OneStep
 from app.web.auth import viewer_token
 from app.web.routes.access import permitted_uri
 from app.web.routes.run import recordings
@@ -24,7 +25,6 @@ from app.worker.protocol import (
     Advance,
     Answer,
     AskCluster,
-    CloudFrame,
     MapChanges,
     Open,
     Pause,
@@ -396,13 +396,13 @@ async def test_the_export_gives_the_bytes_of_the_command(both: Running, tmp_path
         assert reply.headers["content-disposition"] == f'attachment; filename="trees.{suffix}"'
 
 
-async def test_the_files_of_a_whole_cloud_are_in_its_coordinates(both: Running) -> None:
+async def test_the_files_of_a_run_of_one_step_are_in_its_coordinates(both: Running) -> None:
     client, dashboard = both
     await show(dashboard)
     assert dashboard.shown is not None
-    cloud = CloudFrame((470600.0, 3810200.0, 300.0), "EPSG:26912", 1000, [])
-    await dashboard.receive(Report(Status("finished", scan_index=0, cloud=cloud)))
-    assert (await client.get("/api/status")).json()["cloud"]["offset"] == [470600.0, 3810200.0, 300.0]
+    one_step = OneStep((470600.0, 3810200.0, 300.0), "EPSG:26912", 1000, [])
+    await dashboard.receive(Report(Status("finished", scan_index=0, one_step=one_step)))
+    assert (await client.get("/api/status")).json()["one_step"]["offset"] == [470600.0, 3810200.0, 300.0]
     x, y = dashboard.shown.frame.trees.position[0]
     row = (await client.get("/api/trees.csv")).text.splitlines()[1].split(",")
     assert [float(row[1]), float(row[2])] == pytest.approx([x + 470600.0, y + 3810200.0], abs=1e-3)

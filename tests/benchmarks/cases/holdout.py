@@ -19,7 +19,7 @@ from tests.benchmarks.table import Cell, Table
 if TYPE_CHECKING:
     from app.extensions.learning.examples import Examples
     from pipeline.classification.forest import Forest
-    from pipeline.inventory.terrain_raster import TerrainRaster
+    from pipeline.ground.terrain_raster import TerrainRaster
     from pipeline.types.records import CloudDescription, Float, Float32, WholeCloud
 
 NAME = "holdout"
@@ -186,7 +186,7 @@ class CutCloud:
         """See WholeCloud."""
         import numpy as np
 
-        from pipeline.inventory.terrain_raster import heights_above
+        from pipeline.ground.terrain_raster import heights_above
 
         rng = np.random.default_rng(self.seed)
         for part in self.cloud.parts():
@@ -195,8 +195,8 @@ class CutCloud:
 
 
 def _whole_clouds() -> Table:
+    from app.extensions.clouds.inventory import map_plot
     from pipeline.config import preset
-    from pipeline.inventory import map_plot
     from pipeline.io.readers.clouds import open_cloud
     from tests.benchmarks.cases.plot import stem_scores
 
@@ -224,9 +224,9 @@ def _low_clouds() -> Table:
     """Clouds that end at 2 to 4 m, thinned clouds, and both, compared with the map of the whole cloud."""
     import numpy as np
 
+    from app.extensions.clouds.inventory import map_plot
     from pipeline.config import preset
     from pipeline.evaluation import match
-    from pipeline.inventory import map_plot
     from pipeline.io.readers.clouds import open_cloud
 
     rows = list[tuple[Cell, ...]]()

@@ -36,8 +36,8 @@ def run() -> list[Table]:
 def _whole(folder: Path) -> Table:
     import time
 
+    from app.extensions.clouds.inventory import map_plot
     from pipeline.config import preset
-    from pipeline.inventory import map_plot
     from pipeline.io.readers.clouds import open_cloud
 
     rows = []

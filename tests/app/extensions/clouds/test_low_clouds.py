@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.extensions.clouds.inventory import SECTION, map_plot
+from app.extensions.clouds.inventory.cross_sections import upper_end
 from pipeline.config import preset
-from pipeline.inventory import SECTION, map_plot
-from pipeline.inventory.cross_sections import upper_end
-from pipeline.inventory.terrain_raster import TerrainRaster
+from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.types.records import Verdict
-from tests.pipeline.inventory.plots import PLACES, Made, bush, ground, hill, plot, stem
+from tests.pipeline.plots import PLACES, Made, bush, ground, hill, plot, stem
 
 FOREST = preset("forest")
 

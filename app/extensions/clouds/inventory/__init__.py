@@ -10,17 +10,10 @@ from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from pipeline.classification import ForestOf, package_alone
-from pipeline.classification.forest import vote
-from pipeline.config import Parameters
-from pipeline.errors import SourceError
-from pipeline.geometry.poses import Float
-from pipeline.inventory.cloud import ExtentFinder, SpooledCloud, Thinned
-from pipeline.inventory.cross_sections import (
+from app.extensions.clouds.inventory.cross_sections import (
     FIGURES,
     HIGHEST,
     LOWEST,
@@ -34,8 +27,9 @@ from pipeline.inventory.cross_sections import (
     trace,
     upper_end,
 )
-from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of, without_heights
-from pipeline.inventory.stem_model import (
+from app.extensions.clouds.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of, without_heights
+from app.extensions.clouds.inventory.spooled_cloud import SpooledCloud
+from app.extensions.clouds.inventory.stem_model import (
     Stems,
     are_stumps,
     classify_stems,
@@ -44,11 +38,16 @@ from pipeline.inventory.stem_model import (
     ends_are_seen,
     is_repeated,
 )
-from pipeline.inventory.terrain_raster import LowestReturns, TerrainRaster, heights_above
+from pipeline.classification import ForestOf, package_alone
+from pipeline.classification.forest import vote
+from pipeline.config import Parameters
+from pipeline.geometry.poses import Float
+from pipeline.geometry.thinning import Thinned
+from pipeline.ground.plot_ground import finish, ground_steps
+from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.io.readers.cloud_frame import UNNAMED
 from pipeline.types.records import CloudDescription, Float32, Int, Int32, Trees, Verdict, WholeCloud
 
-MOST_RASTER = 96 << 20  # bytes
 COARSE = 0.04  # m; coarser thinning makes diameters less precise
 NEVER = -1  # an unknown time
 TRACED = 8  # columns between two reports of progress
@@ -62,8 +61,6 @@ NARROW, LONG_SIDE = 0.5, 4.0  # stems are as thick, and the cloud of a single on
 HIGHEST_TREE, LARGEST_NORTHING = 116.0, 1e7
 GIANT_HEIGHT, GIANT_DBH = 60.0, 0.8  # m; a pine of 20 m and 0.25 m has both if its feet are taken as metres
 SHOWN, SHOWN_SIDE = 1 << 17, 0.02  # points of all heights that are kept, and smallest side of their cubes [m]
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,7 +250,9 @@ class Inventory:
             OSError: The temporary file of the points cannot be read.
         """
         whole = Thinned(SHOWN, SHOWN_SIDE)
-        ground, near, counts = yield from ground_steps(self._cloud, slope_max, whole=whole)
+        ground, near, counts = yield from ground_steps(
+            self._cloud, slope_max, band=(LOWEST, HIGHEST), whole=whole
+        )
         yield 0.38
         voxels = voxels_of(whole.points, whole.side)
         yield 0.4
@@ -264,80 +263,6 @@ class Inventory:
             tiles.append(tile)
             yield 0.45
         return PlotPoints(ground, near, slices, *strongest_first(tiles), voxels, counts)
-
-
-def finish(steps: Generator[float, None, T]) -> T:
-    """Return the result of a generator after all of its steps; what they yield is discarded."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
-
-
-def ground_steps(
-    cloud: WholeCloud,
-    slope_max: float,
-    *,
-    band: tuple[float, float] = (LOWEST, HIGHEST),
-    most: int = 1 << 21,
-    whole: Thinned | None = None,
-) -> Generator[float, None, tuple[TerrainRaster, Thinned, dict[str, int]]]:
-    """Return the ground below a cloud, the thinned points of the cloud (x, y, z, height above the ground) in
-    a band, and counts; yield the share of the whole inventory that is done after each part.
-
-    Args:
-        cloud: The cloud, which is read three times.
-        slope_max: Largest slope of the terrain against the plane of the plot [degrees].
-        band: Lowest and highest height above the ground that is kept, both exclusive [m].
-        most: Maximum number of points after thinning, a power of two.
-        whole: Table to which the points of all heights in the plot are added; None for none.
-
-    Returns:
-        Ground; points, of which there may be none; and a dict from "read", "apart from the plot" (left out)
-        and "below the ground" (by more than 0.3 m) to numbers of points.
-
-    Raises:
-        SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER bytes.
-        OSError: The temporary file of the points cannot be read.
-    """
-    finder, of = ExtentFinder(), max(cloud.description.points, 1)
-    read = 0
-    for part in cloud.parts():
-        finder.add(part, cloud.description.uri)
-        read += len(part)
-        yield min(0.2 * read / of, 0.2)
-    extent = finder.extent(cloud.description.uri)
-    room = LowestReturns.room(extent.low, extent.high)
-    if room > MOST_RASTER:
-        wide, long = (extent.high - extent.low).tolist()
-        raise SourceError(
-            f"the cloud is too large for one plot: {wide:.0f} x {long:.0f} m",
-            where=cloud.description.uri,
-            remedy="Cut it into plots of at most 400 x 400 m; if its coordinates are no metres, name their "
-            "unit with --unit",
-        )
-    lowest = LowestReturns(extent.low, extent.high)
-    for part in cloud.parts():
-        lowest.add(part)
-        yield 0.2
-    ground = lowest.ground(float(np.radians(slope_max)))
-    del lowest
-    near, below = Thinned(most), 0
-    yield 0.3
-    for part in cloud.parts():
-        inside = ((part[:, :2] >= extent.low) & (part[:, :2] <= extent.high)).all(axis=1)
-        part = part[inside]
-        above = heights_above(part, ground)
-        below += int(np.count_nonzero(above < -0.3))
-        chosen = (above > band[0]) & (above < band[1])
-        near.add(np.column_stack([part[chosen], above[chosen]]))
-        if whole is not None:
-            whole.add(np.column_stack([part, above]))
-        yield 0.35
-    counts = {"read": extent.points, "apart from the plot": extent.apart, "below the ground": below}
-    return ground, near, counts
 
 
 def _trees(stems: Stems, arc_min: float, crowns: Crowns) -> Trees:

@@ -21,7 +21,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud, open_source
 from pipeline.io.readers.clouds import offset_for, open_cloud
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
-from tests.pipeline.inventory.plots import plot, write_las
+from tests.pipeline.plots import plot, write_las
 
 UTM = np.array([470600.0, 3810200.0, 2278.0])
 TEXT = (

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.extensions.clouds.inventory import map_plot
+from app.extensions.clouds.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from pipeline.config import preset
-from pipeline.inventory import map_plot
-from pipeline.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
-from tests.pipeline.inventory.plots import Made, ground, stem
+from tests.pipeline.plots import Made, ground, stem
 
 
 def fitted(xy):

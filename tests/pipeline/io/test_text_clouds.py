@@ -14,7 +14,7 @@ from app.cli import main
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud, open_source, recordings_in
 from pipeline.io.readers.clouds import open_cloud
-from tests.pipeline.inventory.plots import plot
+from tests.pipeline.plots import plot
 
 POINTS = np.round(np.random.default_rng(3).uniform(-9.0, 9.0, (500, 3)), 3)
 UTM = np.array([470_612.25, 6_810_203.5, 278.0])

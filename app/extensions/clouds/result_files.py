@@ -21,13 +21,13 @@ from app.batch.map_run import MappingResult
 from app.batch.run_folder import NO_PATH, as_written, score_map, truth_in_metres
 from app.batch.summary import FAR_FROM_PLOT, evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
+from app.extensions.clouds.inventory import PlotMap, map_plot
+from app.extensions.clouds.inventory.cross_sections import slice_heights
 from app.store.forests import kept_forests
 from pipeline.config import Parameters
 from pipeline.evaluation import MapScores
 from pipeline.geometry.poses import Float
-from pipeline.inventory import PlotMap, map_plot
-from pipeline.inventory.cross_sections import slice_heights
-from pipeline.inventory.terrain_raster import TerrainRaster
+from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.io.result_files import (
     ROBOTS_FRAME,
     TERRAIN_COLUMNS,

@@ -15,7 +15,7 @@ from pipeline.simulation import cloud_run
 from pipeline.simulation.cloud_run import first_surfels, lay_surfels
 from pipeline.simulation.lidar import SpinningLidar
 from pipeline.simulation.scenarios import parse_uri
-from tests.pipeline.inventory.plots import PLACES, plot, stem, write_las
+from tests.pipeline.plots import PLACES, plot, stem, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)
 

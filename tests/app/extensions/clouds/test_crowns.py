@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.extensions.clouds.inventory import Inventory, map_plot
+from app.extensions.clouds.inventory.spooled_cloud import SpooledCloud
 from pipeline.config import preset
-from pipeline.inventory import Inventory, finish, map_plot
-from pipeline.inventory.cloud import SpooledCloud
-from tests.pipeline.inventory.plots import Made, ground, stem
+from pipeline.ground.plot_ground import finish
+from tests.pipeline.plots import Made, ground, stem
 
 FOREST = preset("forest")
 TOP = 12.0  # m

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.extensions.clouds.inventory.cross_sections import STEP, TUKEY, slice_heights, without_scatter
 from pipeline.classification.column_extraction import BREAST
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES
@@ -14,7 +15,6 @@ from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.detection.cylinder_fit import MODEL
 from pipeline.detection.verdicts import AT_LEAST, AT_MOST, Check
 from pipeline.geometry.poses import Float
-from pipeline.inventory.cross_sections import STEP, TUKEY, slice_heights, without_scatter
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Int32, Verdict
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.extensions.clouds.inventory import map_plot
 from pipeline.config import preset
 from pipeline.errors import SourceError
-from pipeline.inventory import map_plot
 from pipeline.types.records import Verdict
-from tests.pipeline.inventory.plots import PLACES, Made, bush, ground, hill, plot, stem
+from tests.pipeline.plots import PLACES, Made, bush, ground, hill, plot, stem
 
 FOREST = preset("forest")
 

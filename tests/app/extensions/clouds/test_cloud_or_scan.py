@@ -15,7 +15,7 @@ from pipeline.io.readers import is_cloud, open_source
 from pipeline.io.readers.base import SourceOptions
 from pipeline.io.readers.clouds import open_cloud
 from pipeline.types.records import Scan
-from tests.pipeline.inventory.plots import plot
+from tests.pipeline.plots import plot
 
 
 def pcd(

@@ -12,7 +12,7 @@ from pipeline.types.records import CloudDescription
 
 @dataclass
 class Made:
-    """A cloud in memory (see `pipeline.inventory.cloud.Cloud`)."""
+    """A cloud in memory (see `app.extensions.clouds.inventory.SpooledCloud`)."""
 
     points: np.ndarray
     losses: dict[str, int] = field(default_factory=dict)

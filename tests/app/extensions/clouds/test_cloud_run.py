@@ -11,16 +11,16 @@ from msgspec.structs import replace
 
 from app.explain.build import cluster_story, tree_story
 from app.explain.build import section as at_breast
+from app.extensions.clouds.inventory import PARAMETERS
 from app.worker.outbox import picture_of
-from app.worker.process import new_session, open_any_or_cloud
+from app.worker.process import new_session, open_any_or_one_step
 from app.worker.protocol import Open, Report, Shown, from_worker
 from app.worker.session import Session, tree_picture
 from pipeline.config import preset
 from pipeline.errors import SourceError, StemmapError
-from pipeline.inventory import PARAMETERS
 from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import Frame, Verdict
-from tests.pipeline.inventory.plots import PLACES, plot, write_las
+from tests.pipeline.plots import PLACES, plot, write_las
 
 FOREST = preset("forest")
 UTM = (470600.0, 3810200.0, 300.0)
@@ -71,16 +71,16 @@ def test_a_cloud_is_mapped_in_steps_without_a_robot(session: Session) -> None:
     assert len(shares) > 20
     assert shares == sorted(shares)
     frame = mapped(session)
-    assert frame.of_cloud
+    assert not frame.of_drive
     assert len(frame.trees.number) == len(PLACES)
     away = np.hypot(*(frame.trees.position[:, None] - PLACES[:, :2]).transpose(2, 0, 1))
     assert away.min(axis=1).max() < 0.03
     status = session.status()
     assert (status.state, status.scans, status.scan_index, status.trees) == ("finished", 1, 0, len(PLACES))
-    assert status.cloud is not None
-    assert status.cloud.offset == (*UTM[:2], 0.0), "heights below 1000 m are kept"
-    assert "26912" in status.cloud.crs
-    assert status.cloud.parameters == list(PARAMETERS)
+    assert status.one_step is not None
+    assert status.one_step.offset == (*UTM[:2], 0.0), "heights below 1000 m are kept"
+    assert "26912" in status.one_step.crs
+    assert status.one_step.parameters == list(PARAMETERS)
     assert set(PARAMETERS) <= set(FOREST.flat())
     assert session.path is not None
     assert len(session.path.x) == 0
@@ -112,11 +112,11 @@ def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session
     np.testing.assert_array_equal(there.counts.covered, session.counts.covered)
     assert replace(there.counts, covered=None) == replace(session.counts, covered=None)
     assert there.counts.verdicts["tree"] == len(PLACES)
-    assert there.frame.of_cloud
+    assert not there.frame.of_drive
     np.testing.assert_array_equal(there.frame.trees.lean, frame.trees.lean)
     status = codec.decode(codec.encode(Report(session.status()))[4:])
     assert isinstance(status, Report)
-    assert status.status.cloud == session.status().cloud
+    assert status.status.one_step == session.status().one_step
 
 
 def test_a_parameter_of_the_inventory_maps_the_cloud_again_and_keeps_the_numbers(session: Session) -> None:
@@ -160,22 +160,22 @@ def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session
     frame = mapped(session)
     for row, number in enumerate(frame.trees.number.tolist()):
         story = tree_story(session.run, session.frame, number)
-        assert story.sections is not None
-        assert len(story.sections) == frame.trees.observations[row]
-        heights = [section.height for section in story.sections]
+        stem = story.further["clouds"]
+        assert len(stem.sections) == frame.trees.observations[row]
+        heights = [section.height for section in stem.sections]
         assert heights == sorted(heights)
-        shown = [section for section in story.sections if section.points]
+        shown = [section for section in stem.sections if section.points]
         assert 3 <= len(shown) <= 9
         assert min(abs(section.height - 1.3) for section in shown) < 0.11
         for section in shown:
             off = np.hypot(*np.array(section.points).T) - section.radius
             assert np.median(np.abs(off)) < 0.02
         true = PLACES[nearest(frame)[row]]
-        breast = min(story.sections, key=lambda section: abs(section.height - 1.3))
+        breast = min(stem.sections, key=lambda section: abs(section.height - 1.3))
         assert breast.radius == pytest.approx(true[2], abs=0.01)
-        assert story.lean_deg == pytest.approx(np.degrees(np.arctan(0.05)), abs=0.5)
-        assert np.isnan(story.height) == bool(story.height_hidden)
-        assert story.height_hidden or story.height == pytest.approx(8.0, abs=4.0 * story.height_sigma)
+        assert stem.lean_deg == pytest.approx(np.degrees(np.arctan(0.05)), abs=0.5)
+        assert np.isnan(stem.height) == bool(stem.height_hidden)
+        assert stem.height_hidden or stem.height == pytest.approx(8.0, abs=4.0 * stem.height_sigma)
     with pytest.raises(StemmapError, match="no tree 99"):
         tree_story(session.run, session.frame, 99)
 
@@ -205,7 +205,7 @@ def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(sessio
         else:
             assert failed == [] or story.verdict == failed[0]
             others += 1
-        assert story.sections
+        assert story.further["clouds"].sections
         assert (story.tree is not None) == (story.verdict == "tree")
     assert others == 3, "bushes"
     with pytest.raises(StemmapError, match="no cluster"):
@@ -235,9 +235,9 @@ def test_a_damaged_cloud_is_refused_and_the_address_of_a_drive_is_no_map(cloud: 
     broken = tmp_path / "broken.laz"
     broken.write_bytes(cloud.read_bytes()[:300])
     with pytest.raises(SourceError):
-        open_any_or_cloud(str(broken), SourceOptions())
-    assert open_any_or_cloud(f"file://{cloud}", SourceOptions()).description.kind.startswith("whole cloud")
-    drive = open_any_or_cloud(f"sim:cloud?file={cloud}", SourceOptions())
+        open_any_or_one_step(str(broken), SourceOptions())
+    assert open_any_or_one_step(f"file://{cloud}", SourceOptions()).description.kind.startswith("whole cloud")
+    drive = open_any_or_one_step(f"sim:cloud?file={cloud}", SourceOptions())
     assert drive.description.has_odometry
     drive.close()
 
@@ -246,9 +246,9 @@ def test_a_run_of_scans_follows_a_cloud(session: Session) -> None:
     mapped(session)
     session.open(Open("sim:stand?duration=2", "auto", 0))
     session.set_parameters(FOREST, 2)
-    assert session.status().cloud is None
+    assert session.status().one_step is None
     session.advance(1)
     while session.pace == "hurry":
         session.work()
     assert session.frame is not None
-    assert not session.frame.of_cloud
+    assert session.frame.of_drive

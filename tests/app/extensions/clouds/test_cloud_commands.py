@@ -13,7 +13,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import open_cloud
 from tests.app.cli.test_commands import stemmap
-from tests.pipeline.inventory.plots import PLACES, hill, plot, write_las
+from tests.pipeline.plots import PLACES, hill, plot, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.inventory.cross_sections import find_columns, strongest_first
-from pipeline.inventory.stem_model import STEM, is_repeated
-from pipeline.inventory.terrain_raster import TerrainRaster
+from app.extensions.clouds.inventory.cross_sections import find_columns, strongest_first
+from app.extensions.clouds.inventory.stem_model import STEM, is_repeated
+from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.types.records import Verdict
-from tests.pipeline.inventory.plots import stem
+from tests.pipeline.plots import stem
 
 
 def test_a_column_is_found_in_a_cloud_of_more_than_a_million_voxels():

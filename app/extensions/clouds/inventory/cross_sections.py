@@ -18,7 +18,7 @@ from pipeline.classification.features import COUNT, features
 from pipeline.classification.voxel_map import SIDE, SLICE, SLICES, TILE, VoxelMap
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
-from pipeline.inventory.terrain_raster import TerrainRaster
+from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.jit import compiled
 from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Float32, Int
