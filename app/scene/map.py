@@ -119,7 +119,7 @@ class MapNodes:
         )
 
     def _show_trees(self, trees: Trees, foot: Float, of_drive: bool, view: ViewSettings) -> None:
-        """Send the trunks; those of a whole cloud are as thick as their circles, which are drawn on their
+        """Send the trunks; without a drive they are as thick as their circles, which are drawn on their
         upper ends.
 
         Args:

@@ -141,7 +141,7 @@ class RunFigures:
         all_scans: Number of scans of the source, None if unknown.
         time_s: Time of the last mapped scan since the first [s].
         distance_m: Driven distance [m].
-        lost: Share of the scans in which the pose was lost, from 0 to 1; None for a whole cloud.
+        lost: Share of the scans in which the pose was lost, from 0 to 1; None without a drive.
         trees: Number of confirmed trees.
         preset: Name of the preset.
         parameters: Dict from the dotted name of each parameter to its value.

@@ -92,7 +92,7 @@ def test_a_filter_selects_trees(dashboard: Dashboard):
         expect(page.locator("#tree-count")).to_have_text(f"{len(fits)} of {len(held)}")
     expect(page.locator("#trees-empty")).to_contain_text("No tree matches “judged”")
     page.locator("#find").fill("height > 10")
-    expect(page.locator("#trees-empty")).to_contain_text("measured in a whole cloud only")
+    expect(page.locator("#trees-empty")).to_contain_text("not measured in a drive")
     page.locator("#find").fill("as thick as my leg")
     expect(page.locator("#trees-empty")).to_contain_text("“as thick as my leg” is not a condition")
     expect(page.locator("#find")).to_have_attribute("aria-invalid", "true")

@@ -12,7 +12,7 @@ from pipeline.types.records import CloudDescription
 
 @dataclass
 class Made:
-    """A cloud in memory (see `app.extensions.clouds.inventory.SpooledCloud`)."""
+    """A cloud in memory (see `pipeline.types.records.WholeCloud`)."""
 
     points: np.ndarray
     losses: dict[str, int] = field(default_factory=dict)

@@ -3,7 +3,7 @@ scanner measures it."""
 
 from __future__ import annotations
 
-from app.extension import Extension
+from app.extension import Extension, page_folder
 
 EXTENSION = Extension(
     help="whole clouds (.laz, .las, .e57, ...): their stems, diameters and heights, mapped without a drive",
@@ -12,4 +12,5 @@ EXTENSION = Extension(
         "info": "app.extensions.clouds.info_command",
     },
     sources="app.extensions.clouds.sources",
+    page=page_folder("clouds"),
 )

@@ -7,7 +7,7 @@ import { on, selectedTree, state, treeOf } from "../core/store.js";
 import { keepFresh, throttled } from "../core/timing.js";
 import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
-import { sectionsFigure } from "../explain/sections.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { annotating, annotationOf, draft, following, measureDbh, reviewOf, typedDbh } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
@@ -46,8 +46,9 @@ const refresh = keepFresh(async () => {
   let points, votes = "", loaded = "";
   try {
     const told = await story(number);
-    points = told.sections ? sectionsFigure(told.sections) : gatheredFigure(told);
-    if (!told.sections) votes = columnFigure(told.column, "Votes on the accumulated scans");
+    const [further] = ofExtensions("treeEvidence", told);
+    points = further ?? gatheredFigure(told);
+    if (!further) votes = columnFigure(told.column, "Votes on the accumulated scans");
     loaded = version;
   } catch (error) {
     points = el("p", { class: "empty", text: capital(error.message) });

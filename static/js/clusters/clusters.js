@@ -4,7 +4,7 @@ import { byId, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed } from "../core/format.js";
 import { selectCluster } from "../core/live_feed.js";
-import { isCloud, isPlaying, on, state } from "../core/store.js";
+import { isDrive, isPlaying, on, state } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { verdictOf } from "../core/verdicts.js";
 import { openStory } from "../explain/story.js";
@@ -24,7 +24,7 @@ function show() {
   }
   const verdicts = Object.entries(state.map.verdicts ?? {}).sort((a, b) => (b[0] === "tree") - (a[0] === "tree") || b[1] - a[1]);
   const clusters = verdicts.reduce((sum, [, number]) => sum + number, 0);
-  const lead = isCloud() ? `${count(clusters, "candidate")} for stems in this cloud, with these verdicts.` : clusters
+  const lead = !isDrive() ? `${count(clusters, "candidate")} for stems, with these verdicts.` : clusters
     ? `Scan ${state.map.index}: ${count(clusters, "cluster")}, with these verdicts.`
     : `Scan ${state.map.index}: no cluster. Check that the pass-through box and the height band contain the stems, and that Radius eps is large enough.`;
   panel().replaceChildren(el("p", { class: "lead", "data-scan": state.map.index, "data-clusters": clusters, text: lead }), bars(verdicts), clusterTable(), points());
@@ -40,12 +40,12 @@ function bars(verdicts) {
       el("span", { text: label }),
       el("span", { class: "bar", style: { background: colour, width: `${(100 * number) / most}%` } }),
       el("span", { class: "count", text: String(number) }),
-      el("span", { class: "reason", text: isCloud() && label === "tree" ? "A stem of the map." : reason }));
+      el("span", { class: "reason", text: !isDrive() && label === "tree" ? "A stem of the map." : reason }));
   }));
 }
 
-// A whole cloud has no scans, so its candidates have no eccentricity and no distance from a sensor.
-const applies = (_, place) => !isCloud() || ![3, 5].includes(place);
+// Without a drive there are no scans, so candidates have no eccentricity and no distance from a sensor.
+const applies = (_, place) => isDrive() || ![3, 5].includes(place);
 
 // One row per cluster, the nearest first; a click opens its story.
 function clusterTable() {

@@ -34,7 +34,7 @@ export const state = {
 export const trees = () => state.map?.trees ?? [];
 export const treeOf = (number) => trees().find((tree) => tree.number === number) ?? null;
 export const selectedTree = () => treeOf(state.selected);
-export const isCloud = () => Boolean(state.status?.cloud);
+export const isDrive = () => !state.status?.one_step;
 export const isPlaying = () => state.status?.state === "playing";
 
 // Clusters of the current scan as [{row, x, y, verdict}].

@@ -3,10 +3,10 @@
 import { definitions, el, letterOf } from "../core/dom.js";
 import { clock, figure, NONE, plusMinus } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
-import { isCloud } from "../core/store.js";
+import { isDrive } from "../core/store.js";
 import { verdictOf } from "../core/verdicts.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { columnFigure } from "./columns.js";
-import { sectionsFigure } from "./sections.js";
 
 const SIZE = 250; // of the picture
 const NAMES = { eccentricity: "eccentricity λ1/λ2" };
@@ -19,36 +19,32 @@ function plain(value, unit) {
 }
 
 export function clusterStory(story) {
-  if (story.sections) return [verdict(story), sectionsFigure(story.sections), checks(story)];
-  return [verdict(story), drawing(story), story.circle ? residuals(story) : "", checks(story),
+  const told = ofExtensions("clusterStory", story);
+  if (told.length) return told;
+  return [verdict(story, why(story)), drawing(story), story.circle ? residuals(story) : "", checks(story),
     columnFigure(story.column, "Accumulated scans at this place")];
 }
 
 // Where the accumulated scans reject a stem of this scan, both verdicts are named and that of the map counts.
-function verdict(story) {
+export function verdict(story, reason) {
   const ofMap = story.verdict === "tree" ? (story.column?.verdict ?? "tree") : story.verdict;
   const title = ofMap === story.verdict ? ofMap : `A stem in this scan; not a tree in the map: ${ofMap}`;
   return el("div", { class: "verdict", "data-verdict": ofMap }, letterOf(verdictOf(ofMap)),
-    el("div", {}, el("b", { text: title }), el("p", { text: why(story) || verdictOf(story.verdict)[2] })));
+    el("div", {}, el("b", { text: title }), el("p", { text: reason || verdictOf(story.verdict)[2] })));
 }
 
 function why(story) {
-  if (!story.checks.length && story.sections) return "It stands upright like a stem, but too few of its slices show a circle.";
   if (!story.checks.length) return "It was found by another program and is used without checks.";
   const failed = story.checks.find((check) => check.fails);
-  if (story.sections) return whyOfCloud(story, failed);
   if (!failed) return "It passed all checks below, so it is a stem and is used by SLAM.";
   if (failed.verdict === "at border") return "It extends beyond the pass-through box, the range or the field of view, so a part of it is not visible.";
   if (!failed.relation) return "Its edge is occluded by a nearer object, so its centre is unknown.";
-  const side = failed.relation === "at most" ? "above" : "below";
-  return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${limitOf(failed)}.`;
+  return failureText(failed);
 }
 
-function whyOfCloud(story, failed) {
-  if (!failed && story.verdict === "tree") return `It passed all checks below. It is tree ${story.tree} of the map.`;
-  if (!failed) return `It passed all checks below, but the decision trees classify its surroundings as ${story.verdict}.`;
+export function failureText(failed) {
   const side = failed.relation === "at most" ? "above" : "below";
-  return `Its ${named(failed)}, ${plain(failed.value, failed.unit)}, is ${side} ${limitOf(failed)}.`;
+  return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${limitOf(failed)}.`;
 }
 
 function limitOf({ limit, unit, title, parameter }) {
@@ -123,9 +119,9 @@ function residuals(story) {
 }
 
 // Without a fitted circle the radial deviation is 0 in the data, which is no measurement.
-const noCircle = (story, check) => !story.circle && !story.sections && check.figure === "radial deviation" && check.value === 0;
+const noCircle = (story, check) => !story.circle && story.distance !== null && check.figure === "radial deviation" && check.value === 0;
 
-function checks(story) {
+export function checks(story) {
   if (!story.checks.length) return "";
   let decided = false;
   const rows = story.checks.map((check) => {
@@ -142,5 +138,5 @@ function checks(story) {
     el("table", { class: "checks" }, el("tbody", {}, ...rows)));
 }
 
-export const clusterTitle = ({ scan, cluster, time_s }) => isCloud() ? `Candidate ${cluster + 1}` :
+export const clusterTitle = ({ scan, cluster, time_s }) => !isDrive() ? `Candidate ${cluster + 1}` :
   `Cluster ${cluster + 1} of scan ${scan}${time_s === undefined ? "" : `, ${clock(time_s)}`}`;

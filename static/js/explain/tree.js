@@ -5,14 +5,15 @@ import { clock, count, figure, isAssumed, NONE, placeText, plusMinus } from "../
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
 import { timeLink } from "../playback/time_link.js";
+import { ofExtensions } from "../shell/extensions.js";
 import { columnFigure } from "./columns.js";
 import { gatheredFigure } from "./gathered.js";
-import { stemStory } from "./sections.js";
 
 const TURN = 2 * Math.PI;
 
 export function treeStory(story, showCluster) {
-  if (story.sections) return stemStory(story);
+  const told = ofExtensions("treeStory", story);
+  if (told.length) return told;
   return [verdict(story), overview(story, showCluster), gatheredFigure(story), positions(story), columnFigure(story.column, "Verdict on the accumulated scans")];
 }
 

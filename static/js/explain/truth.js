@@ -2,12 +2,12 @@
 
 import { el } from "../core/dom.js";
 import { figure } from "../core/format.js";
-import { isCloud, state } from "../core/store.js";
+import { isDrive, state } from "../core/store.js";
 import { timeLink } from "../playback/time_link.js";
 
 export function truthStory({ kind, x, y }) {
   const title = el("h2", { text: `${kind[0].toUpperCase()}${kind.slice(1)} of the ground truth` });
-  if (isCloud() || !state.path.length) return [title, el("p", { text: "Nothing was found at this place, so it is not in the map as a tree." })];
+  if (!isDrive() || !state.path.length) return [title, el("p", { text: "Nothing was found at this place, so it is not in the map as a tree." })];
   const gaps = state.path.map(([px, py]) => Math.hypot(px - x, py - y));
   const nearest = gaps.reduce((best, gap, scan) => (gap < gaps[best] ? scan : best), 0);
   // Scans follow one another evenly; half a scan keeps a rounded time from being the one before.

@@ -45,9 +45,9 @@ function drawContent(pen, view, state, isRejected) {
   }
   pen.globalAlpha = 1;
   state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0));
-  drawNumbers(pen, view, trees.filter((tree) => !isLeftOut(tree)), state.selected, { robot: state.map && !state.status?.cloud && view.toScreen(...state.map.pose) });
+  drawNumbers(pen, view, trees.filter((tree) => !isLeftOut(tree)), state.selected, { robot: state.map && !state.status?.one_step && view.toScreen(...state.map.pose) });
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster);
-  if (state.map && !state.status?.cloud) drawRobot(pen, view, state.map);
+  if (state.map && !state.status?.one_step) drawRobot(pen, view, state.map);
   if (state.measure?.to) drawMeasure(pen, view, state.measure);
 }
 

@@ -8,7 +8,7 @@ import { saveCanvas, saveCsv } from "../core/download.js";
 import { dbhText, heightText, NONE, seenText } from "../core/format.js";
 import { select, selectCluster } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
-import { clusters, isCloud, on, state, trees } from "../core/store.js";
+import { clusters, isDrive, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { openStory } from "../explain/story.js";
 import { ofExtensions } from "../shell/extensions.js";
@@ -34,7 +34,7 @@ const map = new MapCanvas(canvas, {
     ofExtensions("drawOnMap", pen, view);
     drawAnnotations(pen, view);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
-    canvas.setAttribute("aria-label", `Map: ${trees().length} trees${isCloud() ? "" : " and the robot's path"}. The table below lists the trees.${measured}`);
+    canvas.setAttribute("aria-label", `Map: ${trees().length} trees${isDrive() ? " and the robot's path" : ""}. The table below lists the trees.${measured}`);
   },
   gestures: {
     press: (at) => byTool("press", at, map.view) || measuring() || grab(at, map.view),
@@ -64,8 +64,8 @@ function describe(at) {
   if (measuring()) return state.measure.from === null ? "Click where the distance begins" : "";
   if (draft.adding || byTool("busy") || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
-  if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isCloud() ? `height ${heightText(tree)}` : seenText(tree));
-  else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict === "tree" && !isCloud() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
+  if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isDrive() ? seenText(tree) : `height ${heightText(tree)}`);
+  else if (cluster) lines.push(`${isDrive() ? "Cluster" : "Candidate"}: ${cluster.verdict === "tree" && isDrive() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
   if (truth) lines.push(`${annotations().some((row) => distance(row, truth) < SAME) ? "Annotation" : "Ground truth"}: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
   return lines.join("\n") || NONE;
 }
@@ -90,7 +90,7 @@ const isRejected = (tree) => reviewOf(tree) === "rejected";
 function showLegend() {
   const kinds = (state.truth ?? []).map(({ kind }) => kind);
   const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"),
-    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: !isCloud() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
+    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: isDrive() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
   setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");
 }

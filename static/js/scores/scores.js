@@ -4,7 +4,7 @@ import { contradictionText, reviewProgress, scoreAgainst, truthText } from "../a
 import { byId, definitions, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { capital, figure, NONE, percent } from "../core/format.js";
-import { isCloud, on, state } from "../core/store.js";
+import { isDrive, on, state } from "../core/store.js";
 import { openSources } from "../open/dialog.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
@@ -57,7 +57,7 @@ function rates(score) {
 
 // A drive is scored near its path only, so the counts can be smaller than the numbers of true and mapped trees.
 function counted({ reach_m: reach }) {
-  return isCloud() ? "" : el("p", { class: "note dim", text: `Counted: what is within ${reach} m of the path (Tune, Evaluation, Reach).` });
+  return !isDrive() ? "" : el("p", { class: "note dim", text: `Counted: what is within ${reach} m of the path (Tune, Evaluation, Reach).` });
 }
 
 function lines(score) {

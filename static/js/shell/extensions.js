@@ -16,6 +16,8 @@
 //                     saves the file of a run with this title, also in place of an option with the same value
 //   runButtons(run, title)  buttons of a run on the page of runs
 //   pairViews()       what shows two runs on that page: functions of their keys
+//   treeStory(story), clusterStory(story)  elements in place of the story of a tree or cluster; none for other stories
+//   treeEvidence(story)  an element in place of the accumulated points in the card of a tree; none for other stories
 // All are optional.
 
 import { attempted, showProblem } from "../core/problem.js";

@@ -4,7 +4,7 @@ import { reviewOf, reviewProgress } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital, figure, NONE } from "../core/format.js";
 import { refusedText } from "../core/permissions.js";
-import { changed, isCloud, on, state, trees } from "../core/store.js";
+import { changed, isDrive, on, state, trees } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 import { isGoing } from "../playback/timeline.js";
 
@@ -20,7 +20,7 @@ const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans ta
 // is hidden first in a narrow strip
 const FIGURES = {
   trees: ["trees", "", (s) => [String(s.trees - rejected()), ...labelOfTrees(s)]],
-  points: ["points", "", (s) => [s.cloud ? s.cloud.points.toLocaleString("en") : NONE]],
+  points: ["points", "", (s) => [s.one_step ? s.one_step.points.toLocaleString("en") : NONE]],
   health: ["SLAM", "", (s) => health(s)],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
@@ -103,10 +103,10 @@ function show() {
     setText(cells[name].small, unit ?? cells[name].unit);
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
-  for (const name of OF_DRIVES) cells[name].cell.hidden = isCloud();
+  for (const name of OF_DRIVES) cells[name].cell.hidden = !isDrive();
   cells.rate.cell.hidden ||= status.state === "finished";
-  cells.points.cell.hidden = !isCloud();
-  document.body.classList.toggle("cloud", isCloud());
+  cells.points.cell.hidden = isDrive();
+  document.body.classList.toggle("one-step", !isDrive());
   cells.health.cell.title = healthFigures();
   cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has the times of the run.";
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
@@ -129,7 +129,7 @@ function showName(title) {
 // The state, with the name of the robot unless it failed: "Live robot1".
 function stateWord(status) {
   if (isGoing(status)) return "Seeking";
-  if (status.cloud && status.state === "finished") return "Mapped";
+  if (status.one_step && status.state === "finished") return "Mapped";
   const word = status.live && status.state === "playing" ? "Live" : (WORDS[status.state] ?? status.state);
   return status.live && status.robot && status.state !== "failed" ? `${word} ${status.robot}` : word;
 }

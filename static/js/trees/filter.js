@@ -4,7 +4,7 @@ import { isReviewed, KINDS, reviewOf, STATES } from "../annotate/annotations.js"
 import { distance, nearest } from "../core/nearest.js";
 import { state } from "../core/store.js";
 
-export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, scans > 50, ± < 5, λ1/λ2 < 10, x -5..5, height > 20 and lean < 5 of a whole cloud; review state: open, confirmed, rejected, skipped, reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
+export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, scans > 50, ± < 5, λ1/λ2 < 10, x -5..5, height > 20 and lean < 5 where they are measured; review state: open, confirmed, rejected, skipped, reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
 
 export const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2)); // of the position [cm]
 

@@ -8,7 +8,7 @@ import { count, figure, fixed, isAssumed, NONE, plusMinus } from "../core/format
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
 import { roving } from "../core/roving.js";
-import { changed, isCloud, on, state, trees } from "../core/store.js";
+import { changed, isDrive, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
 import { saveWritten } from "../core/written_file.js";
@@ -22,14 +22,14 @@ const EVERY = 400; // [ms] between two updates
 
 const MARKS = { open: "", confirmed: " ✓", rejected: " ✕", skipped: " ↷" };
 
-// key, title, tooltip, text, value for sorting (null if unknown), and whether it is shown only for a whole cloud (true) or a run of scans (false)
+// key, title, tooltip, text, value for sorting (null if unknown), and whether it is shown only without a drive (true) or with one (false)
 const COLUMNS = [
   ["number", "tree", "Number of the tree; ✓ confirmed, ✕ rejected, ↷ skipped in the review", (t) => `${t.number}${MARKS[reviewOf(t)]}`, (t) => t.number],
-  ["x", "x m", "x in the frame of the map: of a drive along the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.x, 2), (t) => t.x],
-  ["y", "y m", "y in the frame of the map: of a drive to the left of the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.y, 2), (t) => t.y],
+  ["x", "x m", "x in the frame of the map: of a drive along the first heading, else as in the file minus its offset", (t) => fixed(t.x, 2), (t) => t.x],
+  ["y", "y m", "y in the frame of the map: of a drive to the left of the first heading, else as in the file minus its offset", (t) => fixed(t.y, 2), (t) => t.y],
   ["sigma", "position ± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
   ["dbh", "DBH cm", "Diameter at breast height ± its standard deviation", (t) => dbh(t), (t) => t.dbh_cm],
-  ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or the cloud does not show it", (t) => (t.height_m === null ? NONE : plusMinus(t.height_m, t.sigma_height_m)), (t) => t.height_m, true],
+  ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or it was not seen", (t) => (t.height_m === null ? NONE : plusMinus(t.height_m, t.sigma_height_m)), (t) => t.height_m, true],
   ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg, true],
   ["e", "λ1/λ2", "Eccentricity λ1/λ2: the mean over its scans", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
   ["seen", "scans", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
@@ -57,7 +57,7 @@ function head() {
 
 // Shows the columns of the kind of run that is open.
 function suitColumns() {
-  for (const row of byId("trees").rows) COLUMNS.forEach(([,,,,, only], place) => { row.cells[place].hidden = only !== undefined && only !== isCloud(); });
+  for (const row of byId("trees").rows) COLUMNS.forEach(([,,,,, only], place) => { row.cells[place].hidden = only !== undefined && only === isDrive(); });
 }
 
 function sortBy(key) {
@@ -153,8 +153,8 @@ function exportAs(format) {
 
 function emptyText(all, wanted, refused) {
   if (all && refused) return `“${refused}” is not a condition. ${HELP}`;
-  if (all) return `No tree matches “${wanted}”.${!isCloud() && /\b(height|lean)\b/i.test(wanted) ? " Heights and leans are measured in a whole cloud only, not in a drive." : ""}`;
-  if (state.map && isCloud()) return "No tree in this cloud. The tab Clusters shows the verdict on each candidate.";
+  if (all) return `No tree matches “${wanted}”.${isDrive() && /\b(height|lean)\b/i.test(wanted) ? " Heights and leans are not measured in a drive." : ""}`;
+  if (state.map && !isDrive()) return "No tree in this map. The tab Clusters shows the verdict on each candidate.";
   return state.map ? "No tree yet. A tree is listed once enough scans have detected it. The tab Clusters shows the verdict on each cluster."
     : nothingYet();
 }

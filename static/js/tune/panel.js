@@ -3,7 +3,7 @@
 import { button, byId, el, letterOf, setText } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count } from "../core/format.js";
-import { isCloud, on, state } from "../core/store.js";
+import { isDrive, on, state } from "../core/store.js";
 import { counted, verdictOf } from "../core/verdicts.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { openTab } from "../shell/tabs.js";
@@ -67,15 +67,15 @@ function groupOf(stage, specs) {
   return group;
 }
 
-const sifting = () => Boolean(byId("tune-find").value.trim() || byId("tune-only").checked || isCloud());
+const sifting = () => Boolean(byId("tune-find").value.trim() || byId("tune-only").checked || !isDrive());
 
-// Whether the map of the open run depends on a parameter; that of a whole cloud depends on few.
-const matters = (name) => !isCloud() || state.status.cloud.parameters.includes(name);
-let siftedForCloud = false;
+// Whether the map of the open run depends on a parameter; that of a run of one step depends on few.
+const matters = (name) => isDrive() || state.status.one_step.parameters.includes(name);
+let siftedForDrive = true;
 
 function siftForRun() {
-  if (!rows.size || siftedForCloud === isCloud()) return;
-  siftedForCloud = isCloud();
+  if (!rows.size || siftedForDrive === isDrive()) return;
+  siftedForDrive = isDrive();
   sift();
 }
 
@@ -210,10 +210,10 @@ function countsBeforeAfter() {
   const names = [...new Set(["tree", ...Object.keys(now), ...Object.keys(then ?? {})])].filter((name) => now[name] || then?.[name] || name === "tree");
   names.sort((a, b) => (b === "tree") - (a === "tree") || (now[b] ?? 0) - (now[a] ?? 0));
   const total = (of) => Object.values(of).reduce((sum, number) => sum + number, 0);
-  const sum = (number) => count(number, isCloud() ? "candidate" : "cluster");
+  const sum = (number) => count(number, isDrive() ? "cluster" : "candidate");
   const pending = state.status?.revision < state.parameters?.revision;
-  const lead = pending ? isCloud() ? "Mapping the cloud …" : "Mapping this scan …" : then ? `${total(then)} → ${sum(total(now))}` : sum(total(now));
-  const title = isCloud() ? "Candidates for stems in the cloud" : `Scan ${index}${then ? ", before and after the last change" : state.status?.state === "playing" ? ". Pause to compare before and after a change." : ". Change a parameter to compare before and after."}`;
+  const lead = pending ? isDrive() ? "Mapping this scan …" : "Mapping …" : then ? `${total(then)} → ${sum(total(now))}` : sum(total(now));
+  const title = isDrive() ? `Scan ${index}${then ? ", before and after the last change" : state.status?.state === "playing" ? ". Pause to compare before and after a change." : ". Change a parameter to compare before and after."}` : "Candidates for stems";
   const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
   return [el("ul", { class: "chips", title, tabindex: "0", "aria-label": "Clusters by verdict" }, el("li", { class: "lead", text: lead }), ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
       same.length ? el("li", { class: "same", text: `unchanged: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];

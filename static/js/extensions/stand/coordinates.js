@@ -200,7 +200,7 @@ function resultText() {
 
 function fill() {
   if (!plotting()) return;
-  const name = stored()?.crs ?? state.status?.cloud?.crs;
+  const name = stored()?.crs ?? state.status?.one_step?.crs;
   setText(byId("coordinates-now"), `Coordinates: ${name ? name.match(/\["([^"]*)"/)?.[1] ?? name : "local"}`);
   byId("coordinates-control").hidden = how() !== "control";
   byId("coordinates-hand").hidden = how() !== "hand";

@@ -80,15 +80,15 @@ def test_the_map_of_a_cloud_is_judged_as_a_whole(mapped, tmp_path, capsys):
     rows = "".join(f"{x + UTM[0]},{y + UTM[1]},{200 * r}\n" for x, y, r in PLACES)
     table.write_text("x_m,y_m,dbh_cm\n" + rows)
     told = stemmap(capsys, "evaluate", mapped, "--truth", table)
-    assert told.out.startswith("trees found (TA) 9/9 (100.0 %), missed (FR) 0/9 (0.0 %) in the whole cloud\n")
-    stemmap(capsys, "evaluate", mapped).refused(1, "--truth", "cloud")
+    assert told.out.startswith("trees found (TA) 9/9 (100.0 %), missed (FR) 0/9 (0.0 %) in the whole plot\n")
+    stemmap(capsys, "evaluate", mapped).refused(1, "--truth", "coordinates of its file")
 
 
 def test_what_needs_a_drive_is_refused_for_a_cloud_in_its_own_words(mapped, cloud, tmp_path, capsys):
     stemmap(capsys, "export", mapped, "--out", tmp_path / "states").refused(1, "has no poses")
     words = ["map", "sim:paper?duration=2", "--continue", mapped, "--out", tmp_path / "both"]
-    stemmap(capsys, *words).refused(1, "whole cloud", "cannot be continued")
-    stemmap(capsys, "merge", mapped, mapped, "--out", tmp_path / "both").refused(1, "whole cloud")
+    stemmap(capsys, *words).refused(1, "no map of a drive", "cannot be continued")
+    stemmap(capsys, "merge", mapped, mapped, "--out", tmp_path / "both").refused(1, "no map of a drive")
     stemmap(capsys, "map", cloud, "--continue", mapped, "--out", tmp_path / "both").refused(2, "--continue")
     assert not (tmp_path / "both").exists()
 
@@ -109,3 +109,17 @@ def test_why_a_cloud_cannot_be_opened_is_said(cloud, monkeypatch, error, says):
     monkeypatch.setattr("pipeline.io.readers.clouds._open_las", fails)
     with pytest.raises(SourceError, match=says):
         open_cloud(str(cloud))
+
+
+@pytest.mark.parametrize("command", ["map", "info"])
+def test_a_cloud_is_refused_if_its_extension_is_switched_off(command, cloud, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv(VARIABLE, "fleet")
+    words = [command, cloud, *(["--out", tmp_path / "out"] if command == "map" else [])]
+    said = f"The extension clouds is switched off by {VARIABLE}."
+    stemmap(capsys, *words).refused(1, "a whole cloud needs an extension", said)
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(SourceError, match="a whole cloud needs an extension"):
+        open_any_or_one_step(str(cloud), SourceOptions())
+    with pytest.raises(SourceError, match="a whole cloud needs an extension"):
+        asyncio.run(check_source(SourceRequest(str(cloud))))
+    assert open_any_or_one_step(f"sim:cloud?file={cloud}", SourceOptions()).description.has_odometry

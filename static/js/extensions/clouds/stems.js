@@ -1,33 +1,53 @@
 // The story of a stem of a whole cloud: its height, cross-sections with the fitted circles, and the stem curve.
 
-import { definitions, el, letterOf } from "../core/dom.js";
-import { count, figure, fixed, NONE, placeText, plusMinus } from "../core/format.js";
-import { circle, line, picture, scaleBar, svg, text } from "../core/svg.js";
-import { verdictOf } from "../core/verdicts.js";
+import { definitions, el, letterOf } from "../../core/dom.js";
+import { count, figure, fixed, NONE, placeText, plusMinus } from "../../core/format.js";
+import { circle, line, picture, scaleBar, svg, text } from "../../core/svg.js";
+import { verdictOf } from "../../core/verdicts.js";
+import { checks, failureText, verdict } from "../../explain/cluster.js";
 
 const SIZE = 120; // of the picture of a section
 const BREAST = 1.3; // [m]
 
-export function stemStory(story) {
+export function treeStory(story) {
+  const stem = story.further.clouds;
+  if (!stem) return [];
   return [el("div", { class: "verdict", "data-verdict": "tree" }, letterOf(verdictOf("tree")),
-    el("div", {}, el("b", { text: "tree" }), el("p", { text: `Circles in ${count(story.observations, "slice")} above one another, between ${figure(story.sections[0].height)} and ${figure(story.sections.at(-1).height)} m above the ground.` }))),
-  figures(story), sectionsFigure(story.sections), stemCurve(story)];
+    el("div", {}, el("b", { text: "tree" }), el("p", { text: `Circles in ${count(story.observations, "slice")} above one another, between ${figure(stem.sections[0].height)} and ${figure(stem.sections.at(-1).height)} m above the ground.` }))),
+  figures(story, stem), sectionsFigure(stem.sections), stemCurve(stem, story)];
 }
 
-function figures(story) {
+export function clusterStory(story) {
+  const stem = story.further.clouds;
+  return stem ? [verdict(story, why(story)), sectionsFigure(stem.sections), checks(story)] : [];
+}
+
+export function treeEvidence({ further }) {
+  return further.clouds ? [sectionsFigure(further.clouds.sections)] : [];
+}
+
+function why(story) {
+  if (!story.checks.length) return "It stands upright like a stem, but too few of its slices show a circle.";
+  const failed = story.checks.find((check) => check.fails);
+  if (failed) return failureText(failed);
+  if (story.verdict === "tree") return `It passed all checks below. It is tree ${story.tree} of the map.`;
+  return `It passed all checks below, but the decision trees classify its surroundings as ${story.verdict}.`;
+}
+
+function figures(story, stem) {
   const [major, minor] = story.ellipse;
-  const measured = story.dbh !== null, seen = story.height !== null;
+  const measured = story.dbh !== null, seen = stem.height !== null;
   return el("div", { class: "stem-figures" }, definitions([
     ["DBH", measured ? `${plusMinus(100 * story.dbh, 100 * story.dbh_sigma)} cm` : NONE],
-    ["height", seen ? `${plusMinus(story.height, story.height_sigma)} m` : "not seen"],
-    ["lean", `${fixed(story.lean_deg, 1)}°`], ["covered", `${figure(story.coverage_deg)}° of 360°`],
+    ["height", seen ? `${plusMinus(stem.height, stem.height_sigma)} m` : "not seen"],
+    ["lean", `${fixed(stem.lean_deg, 1)}°`], ["covered", `${figure(story.coverage_deg)}° of 360°`],
     ["x, y", placeText(story.position)], ["position ±", `${figure(100 * major, 2)} × ${figure(100 * minor, 2)} cm`]]),
   measured ? "" : el("p", { class: "dim note", text: `The DBH needs ${figure(story.dbh_arc_deg)}° of the circumference.` }),
-  seen ? "" : el("p", { class: "dim note", text: `Height not seen: ${story.height_hidden}.` }));
+  seen ? "" : el("p", { class: "dim note", text: `Height not seen: ${stem.height_hidden}.` }));
 }
 
 // Pictures of the sections with points, highest first, all at one scale.
-export function sectionsFigure(sections) {
+function sectionsFigure(sections) {
   const shown = sections.filter(({ points }) => points.length).reverse();
   if (!shown.length) return "";
   const reach = Math.max(0.05, ...shown.map(({ radius, points }) => Math.max(radius ?? 0, ...points.map(([x, y]) => Math.hypot(x, y)))));
@@ -46,7 +66,7 @@ function sectionPicture({ height, radius, points, coverage_deg: covered, scatter
 }
 
 // Diameter over height with sigma.
-function stemCurve({ sections, dbh, dbh_sigma: sigma }) {
+function stemCurve({ sections }, { dbh, dbh_sigma: sigma }) {
   const known = sections.filter(({ radius }) => radius !== null);
   if (known.length < 2) return "";
   const [width, tall, left, right, top, bottom] = [400, 200, 40, 388, 14, 168];
