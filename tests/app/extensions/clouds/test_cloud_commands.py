@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import json
 
@@ -9,8 +10,13 @@ import numpy as np
 import pytest
 
 from app.cli import main
+from app.extension import VARIABLE
+from app.sources.opening import check_source
+from app.sources.request import SourceRequest
+from app.worker.process import open_any_or_one_step
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
+from pipeline.io.readers.base import SourceOptions
 from pipeline.io.readers.clouds import open_cloud
 from tests.app.cli.test_commands import stemmap
 from tests.pipeline.plots import PLACES, hill, plot, write_las
