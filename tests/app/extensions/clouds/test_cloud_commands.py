@@ -119,7 +119,7 @@ def test_why_a_cloud_cannot_be_opened_is_said(cloud, monkeypatch, error, says):
 
 @pytest.mark.parametrize("command", ["map", "info"])
 def test_a_cloud_is_refused_if_its_extension_is_switched_off(command, cloud, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv(VARIABLE, "fleet")
+    monkeypatch.setenv(VARIABLE, "")
     words = [command, cloud, *(["--out", tmp_path / "out"] if command == "map" else [])]
     said = f"The extension clouds is switched off by {VARIABLE}."
     stemmap(capsys, *words).refused(1, "a whole cloud needs an extension", said)

@@ -20,7 +20,7 @@ from pipeline.io.readers.point_files import MISSING
 from tests.pipeline.plots import PLACES, plot, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)
-DATA = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[3] / "../shared/data"))
+DATA = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "../shared/data"))
 
 
 @pytest.fixture(scope="module")
