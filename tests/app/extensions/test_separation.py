@@ -23,7 +23,7 @@ from tests.app.server_for_tests import BEARER, HOST, PORT, TOKEN
 ROOT = Path(__file__).resolve().parents[3]
 #: Words by which only the files of an extension name what it does.
 WORDS = {
-    "clouds": r"(?<!stand )inventory|of_cloud|map_plot|PlotMap|stem curve|sectionsFigure|CloudSource|extensions.clouds",
+    "clouds": r"(?<!stand )inventory|of_cloud|map_plot|PlotMap|stem curve|CloudSource|extensions.clouds",
     "dds": r"\bdds:|DdsLink|cyclone|plain DDS|fast_?dds",
     "fleet": r"fleet|robots-link|common.map",
     "formats": r"victoria",
