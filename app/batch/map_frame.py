@@ -153,8 +153,8 @@ def reproject(points: Float, source: str, target: str) -> Float:
 
 
 def read_map_frame(folder: FilePath) -> MapFrame:
-    """Return the frame of the map of a run: that of georeference.json, else that of a source of one step with a
-    known reference system, else the local one.
+    """Return the frame of the map of a run: that of georeference.json, else that of a source of one step with
+    a known reference system, else the local one.
 
     Raises:
         SourceError: run.json is missing, a file is damaged, or the reference system of georeference.json is
