@@ -410,7 +410,10 @@ def comparison_map(rows: list[dict[str, Any]]) -> str:
     scale = 180.0 / max(float((high - low).max()), 1.0)
     width, height = ((high - low) * scale).tolist()
     environment = Environment(
-        loader=PackageLoader("app.batch", "."), autoescape=True, trim_blocks=True, keep_trailing_newline=True
+        loader=PackageLoader("app.extensions.stand", "."),
+        autoescape=True,
+        trim_blocks=True,
+        keep_trailing_newline=True,
     )
     at = (place - [low[0], high[1]]) * [scale, -scale]
     return environment.get_template("comparison.svg.j2").render(
