@@ -48,8 +48,8 @@ class Extension:
             page of runs (static/js/shell/extensions.js), with main.css and runs.css; each may be missing.
         formats: Returns formats of files and their readers, which are tried after those of the program.
         addresses: Dotted module by the scheme of the addresses of live sources. The module has `parse(uri)`,
-            which returns an `app.robot.address.Address`, and `connect(address, inbox)`, which returns an
-            `app.robot.link.Link`.
+            which returns an `app.sources.live_address.Address`, and `connect(address, inbox)`, which
+            returns an `app.robot.link.Link`.
         sources: Dotted module of sources that are mapped in one step instead of scan by scan. The module has
             `WHAT`, their name for people, `takes(uri, options)`, which returns whether a source is one of
             them, `check(uri, options)`, which raises SourceError for one that cannot be opened, and

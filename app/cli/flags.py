@@ -236,7 +236,7 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
     """
     import time
 
-    from app.robot.address import is_live
+    from app.sources.live_address import is_live
 
     is_requested = arguments.record is not None or arguments.publish
     if is_requested and not all(is_live(uri) for uri in sources):

@@ -108,8 +108,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run
     from app.batch.run_folder import check_folder
-    from app.robot.address import is_live
     from app.robot.source import LiveSource, open_any
+    from app.sources.live_address import is_live
     from app.worker.numba_warmup import compile_ahead
     from app.worker.run import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees

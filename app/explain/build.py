@@ -20,7 +20,6 @@ from app.explain.records import (
     half_axes,
 )
 from app.store.forests import kept_forests
-from app.worker.one_step_run import OneStepRun
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import (
     CLASSES,
@@ -41,7 +40,6 @@ from pipeline.types.records import Clusters, Frame, Sensor, Verdict
 
 if TYPE_CHECKING:
     from app.worker.run import Run
-    from app.worker.session import AnyRun
 
 
 _NS = 1_000_000_000
@@ -63,8 +61,8 @@ def warm_up(sensor: Sensor) -> None:
     feature_effects(np.zeros(len(NAMES)), standard_forest(sensor.rings > 0), Verdict.TREE)
 
 
-def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStory:
-    """Return the explanation of a cluster of a recent scan, or of the map of a run of one step.
+def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
+    """Return the explanation of a cluster of a recent scan.
 
     Args:
         run: The open run, or None.
@@ -76,8 +74,6 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
     """
     if run is None or not 0 <= cluster < len(frame.clusters.size):
         raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
-    if isinstance(run, OneStepRun):
-        return run.cluster_story(cluster)
     parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     points = frame.filtered[frame.labels == cluster].astype(np.float64)
@@ -107,8 +103,8 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
     )
 
 
-def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStory:
-    """Return the explanation of a tree after a scan, or in the map of a run of one step.
+def tree_story(run: Run | None, frame: Frame | None, number: int) -> TreeStory:
+    """Return the explanation of a tree after a scan.
 
     Args:
         run: The open run, or None.
@@ -119,8 +115,6 @@ def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStor
         StemmapError: No run is open, no scan was mapped, there is no such tree at this time, or the forest in
             force cannot be read.
     """
-    if isinstance(run, OneStepRun):
-        return run.tree_story(number)
     rows = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
     if run is None or frame is None or not len(rows):
         raise StemmapError(

@@ -10,7 +10,12 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
-from app.robot.address import (
+from app.robot.link import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox, Link
+from app.robot.recorder import Recorder
+from app.robot.topics import SCAN_TYPES, Choice, choose
+from app.robot.velodyne import VelodyneLink
+from app.robot.zenoh import RosPublisher, ZenohLink
+from app.sources.live_address import (
     ALL_ROBOTS,
     Address,
     VelodyneAddress,
@@ -19,11 +24,6 @@ from app.robot.address import (
     is_live,
     parse_address,
 )
-from app.robot.link import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox, Link
-from app.robot.recorder import Recorder
-from app.robot.topics import SCAN_TYPES, Choice, choose
-from app.robot.velodyne import VelodyneLink
-from app.robot.zenoh import RosPublisher, ZenohLink
 from app.sources.opening import open_source
 from pipeline.config import Parameters
 from pipeline.errors import SourceError

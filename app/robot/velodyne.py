@@ -7,9 +7,9 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from app.robot.address import VelodyneAddress
 from app.robot.link import Inbox, Link
 from app.robot.topics import Publisher
+from app.sources.live_address import VelodyneAddress
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.topics import VELODYNE_SCAN, standard_types

@@ -11,9 +11,9 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from app.robot.address import ROOT, ZenohAddress
 from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, Inbox, Link, first_line
 from app.robot.topics import NAME, SCAN_TYPES, TYPE, Publisher
+from app.sources.live_address import ROOT, ZenohAddress
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel
 from pipeline.io.recording.messages import LATCHED, TYPES, type_hash

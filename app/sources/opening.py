@@ -3,7 +3,7 @@ memory, computing time, time and output.
 
 A damaged or hostile file can take gigabytes, hang, or end the process that opens it. `open_source` and
 `open_cloud` open it first in a copy of this process, with limits that grow with the size of the file. `ask`
-starts `app.sources.inspection_process` for the server, which does not import what only that process needs.
+starts `app.dashboard.inspection_process` for the server, which does not import what only that process needs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import msgspec
 
 from app.common.child_process import ChildError, ChildProcess, ProtocolError, python_module
 from app.extension import extensions_on
-from app.robot.address import is_live, parse_address
+from app.sources.live_address import is_live, parse_address
 from app.sources.one_step import check_one_step
 from app.sources.request import SourceRequest
 from pipeline.errors import SourceError, StemmapError
@@ -282,7 +282,7 @@ def _size(uri: str) -> int | None:
 
 # --- questions of the server ------------------------------------------------------------------------
 
-COMMAND = python_module("app.sources.inspection_process")
+COMMAND = python_module("app.dashboard.inspection_process")
 PATIENCE_S = 120.0
 #: A large recording on a slow disk takes minutes to be opened.
 OPENING_LIMIT_S = 300.0

@@ -30,6 +30,7 @@ import msgspec
 from app.common.text import COMPILING
 from app.explain.build import cluster_story, section, tree_story
 from app.worker import protocol
+from app.worker.one_step_run import OneStepRun
 from app.worker.outbox import RecentScans, for_comparison
 from app.worker.session import Session, camera_picture, tree_picture
 from pipeline.config.model import validated
@@ -492,6 +493,8 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
                 raise StemmapError("no run is open", remedy="Open one")
             return protocol.Answer(ticket, course=run.course(names, most, stages=stages))
         case protocol.AskTree(tree=tree):
+            if isinstance(run, OneStepRun):
+                return protocol.Answer(ticket, tree=run.tree_story(tree))
             return protocol.Answer(ticket, tree=tree_story(run, session.frame, tree))
         case protocol.AskCluster(scan=scan, cluster=cluster):
             frame = recent.find(question.run, scan)
@@ -499,6 +502,8 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
                 raise StemmapError(
                     f"scan {scan} was shown too long ago", remedy="Click a cluster of the newest one"
                 )
+            if isinstance(run, OneStepRun):
+                return protocol.Answer(ticket, cluster=run.cluster_story(cluster))
             return protocol.Answer(ticket, cluster=cluster_story(run, frame, cluster))
 
 

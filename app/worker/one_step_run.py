@@ -192,9 +192,15 @@ class OneStepRun:
         return self._map.tree_story(self.frame, int(rows[0]), self._mapped_with)
 
     def cluster_story(self, row: int) -> ClusterStory:
-        """Return the explanation of a cluster; raises StemmapError if there is no map yet."""
+        """Return the explanation of a cluster.
+
+        Raises:
+            StemmapError: There is no such cluster, or no map yet.
+        """
         if self._map is None or self.frame is None:
             raise _nothing_mapped()
+        if not 0 <= row < len(self.frame.clusters.size):
+            raise StemmapError(f"there is no cluster {row} in the map", remedy="Select another")
         return self._map.cluster_story(self.frame, row, self._mapped_with)
 
     def close(self) -> None:

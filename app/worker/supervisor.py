@@ -12,7 +12,7 @@ from typing import Literal
 
 from app.common.child_process import ChildProcess, exit_reason, python_module, starved_s
 from app.common.timers import cancel
-from app.robot.address import is_live
+from app.sources.live_address import is_live
 from app.worker import protocol
 from pipeline.errors import StemmapError
 

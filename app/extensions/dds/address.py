@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import ClassVar
 
-from app.robot.address import TOPICS, Address, domain_of, known_options, topics_of
 from app.robot.link import Inbox, Link
+from app.sources.live_address import TOPICS, Address, domain_of, known_options, topics_of
 from pipeline.errors import SourceError
 
 _OPTIONS = ("domain", "interface", "peer", "robot", *TOPICS)

@@ -30,10 +30,10 @@ from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.dashboard.payload import clearance_payload, trees_payload
 from app.extension import page_folder
-from app.robot.address import ALL_ROBOTS, ROOT, ZenohAddress, is_live, parse_address
 from app.robot.link import Inbox
 from app.robot.zenoh import ZenohLink
 from app.sources import opening
+from app.sources.live_address import ALL_ROBOTS, ROOT, ZenohAddress, is_live, parse_address
 from app.web.app import MakeScene, MakeWorker, build, guarded
 from app.web.auth import AccessTokens, role_of
 from app.web.responses import error_reply, json_reply

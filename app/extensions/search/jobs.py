@@ -30,7 +30,7 @@ from app.common.child_process import (
     python_module,
 )
 from app.common.text import count, version
-from app.robot.address import is_live
+from app.sources.live_address import is_live
 from app.sources.request import SourceRequest
 from app.store.records import Content, contents_of
 from pipeline.errors import StemmapError

@@ -28,7 +28,7 @@ from app.extensions.search.jobs import COMMAND as SCORING
 from app.extensions.search.jobs import Job, JobResult, ResultStore, RunWithTruth, ScoringProcesses
 from app.extensions.search.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
 from app.extensions.search.result import Result, SearchMessage, best_parameters, for_page, toml_of
-from app.robot.address import is_live
+from app.sources.live_address import is_live
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.records import Content
 from app.store.store import AnnotatedSource

@@ -109,7 +109,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
     """
     from app.extensions.search.plan import SENSIBLE, Plan, axes_of
     from app.extensions.search.scoring import open_run
-    from app.robot.address import is_live
+    from app.sources.live_address import is_live
 
     for uri in (*arguments.runs, *arguments.held_out):
         if is_live(uri):

@@ -318,7 +318,7 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
             not fit the path.
     """
     from app.batch.continue_map import read_saved_run
-    from app.robot.address import is_live
+    from app.sources.live_address import is_live
     from app.sources.opening import open_source
     from pipeline.io.readers.measured_poses import fit_rigid
     from pipeline.io.readers.ros import RosSource

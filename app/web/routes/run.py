@@ -153,7 +153,7 @@ async def open_source(body: _Source, dashboard: Dash, permitted: Permitted) -> R
 @router.post("/inside")
 async def inside(body: _Uninspected, permitted: Permitted) -> Response:
     """POST /api/inside: return the topics of a recording or a robot and the mounting of its LiDAR, read by a
-    child process (see `app.sources.inspection_process.inside`); 403 if the address is not permitted on this
+    child process (see `app.dashboard.inspection_process.inside`); 403 if the address is not permitted on this
     server, 409 if it cannot be read."""
     return json_reply(await ask({"ask": "inside", "path": checked_uri(body.uri, permitted)}))
 

@@ -201,7 +201,7 @@ async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], 
 
 async def whole_run(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
     """Return a run as a dict of JSON values: the keys of `_row` for a record, or of
-    `app.sources.inspection_process.finished` for a folder, with `key`, `map`, `revisions` (list of
+    `app.dashboard.inspection_process.finished` for a folder, with `key`, `map`, `revisions` (list of
     `_revision`; [] for a folder) and `differences`, see `_differences`.
 
     Args:

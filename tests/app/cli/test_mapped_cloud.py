@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.batch.run_folder import read_run
-from app.sources.inspection_process import cloud
+from app.dashboard.inspection_process import cloud
 from app.sources.opening import open_cloud
 from pipeline.errors import StemmapError
 from tests.app.cli.test_commands import stemmap

@@ -7,9 +7,15 @@ import pytest
 
 from app.explain.build import cluster_story, tree_story
 from app.worker.protocol import Open
+from app.worker.run import Run
 from app.worker.session import Session
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame, Verdict
+
+
+def drive(session: Session) -> Run:
+    assert isinstance(session.run, Run)
+    return session.run
 
 
 def frame_of(session: Session) -> Frame:
@@ -21,7 +27,7 @@ def test_the_verdict_of_every_cluster_is_that_of_its_first_check_that_fails(sess
     frame = frame_of(session)
     assert len(frame.clusters.size) > 20
     for row in range(len(frame.clusters.size)):
-        story = cluster_story(session.run, frame, row)
+        story = cluster_story(drive(session), frame, row)
         failed = [check.verdict for check in story.checks if check.fails]
         assert story.verdict == (failed[0] if failed else "tree")
         assert story.verdict == Verdict(int(frame.clusters.verdict[row])).label
@@ -32,7 +38,7 @@ def test_the_verdict_of_every_cluster_is_that_of_its_first_check_that_fails(sess
 def test_the_fit_that_is_drawn_is_the_fit_that_was_judged(session: Session):
     frame = frame_of(session)
     for row in frame.detections.cluster:
-        story = cluster_story(session.run, frame, int(row))
+        story = cluster_story(drive(session), frame, int(row))
         assert story.circle is not None
         assert story.circle.radius == pytest.approx(frame.clusters.radius[row], rel=1e-9)
         assert story.circle.arc_deg == pytest.approx(np.degrees(frame.clusters.arc[row]), rel=1e-9)
@@ -51,7 +57,7 @@ def test_the_fit_that_is_drawn_is_the_fit_that_was_judged(session: Session):
 def test_a_cluster_of_a_tree_names_the_tree(session: Session):
     frame = frame_of(session)
     trees = frame.trees
-    named = [cluster_story(session.run, frame, int(row)) for row in frame.detections.cluster]
+    named = [cluster_story(drive(session), frame, int(row)) for row in frame.detections.cluster]
     with_tree = [story for story in named if story.tree is not None]
     assert len(with_tree) > 10
     for story in with_tree:
@@ -69,7 +75,7 @@ def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Sessio
     rows = np.flatnonzero(trees.confirmed & (trees.observations >= 12) & near)
     assert len(rows) > 5
     for row in rows:
-        story = tree_story(session.run, session.frame, int(trees.number[row]))
+        story = tree_story(drive(session), session.frame, int(trees.number[row]))
         assert 10 * sum(story.sides) == pytest.approx(story.coverage_deg)
         assert story.column is not None
         assert story.column.verdict == "tree"
@@ -87,9 +93,9 @@ def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Sessio
 def test_what_is_not_there_is_refused_in_words(session: Session):
     frame = frame_of(session)
     with pytest.raises(StemmapError, match="no cluster 9999"):
-        cluster_story(session.run, frame, 9999)
+        cluster_story(drive(session), frame, 9999)
     with pytest.raises(StemmapError, match="tree 9999 is not known"):
-        tree_story(session.run, session.frame, 9999)
+        tree_story(drive(session), session.frame, 9999)
 
 
 def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):
@@ -105,7 +111,7 @@ def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):
     frame = frame_of(mapped)
     assert len(frame.clusters.size) > 0
     for row in range(len(frame.clusters.size)):
-        story = cluster_story(mapped.run, frame, row)
+        story = cluster_story(drive(mapped), frame, row)
         assert story.circle is None
         assert story.residual == []
         assert story.column is None

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from app.explain.build import BREAST_HIGH, BREAST_LOW, REACH, points_around, section, tree_story
 from app.worker.session import Session
 from pipeline.classification.voxel_map import SIDE, VoxelMap
+from tests.app.explain.test_build import drive
 
 
 def voxels_of(points: np.ndarray) -> VoxelMap:
@@ -95,9 +96,8 @@ def test_the_points_of_a_mapped_tree_are_on_its_fitted_circle(session: Session):
         true = np.argmin(distance)
         if truth.trees.kind[true] != "tree" or distance[true] > 0.1:
             continue
-        points = np.array(tree_story(session.run, session.frame, int(trees.number[row])).points).reshape(
-            -1, 3
-        )
+        story = tree_story(drive(session), session.frame, int(trees.number[row]))
+        points = np.array(story.points).reshape(-1, 3)
         at_breast = points[(points[:, 2] >= BREAST_LOW) & (points[:, 2] < BREAST_HIGH)]
         if len(at_breast) < 10:  # far away, every fourth scan is accumulated only
             continue

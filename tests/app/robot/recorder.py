@@ -31,8 +31,8 @@ class _SlowRun:
 
     def __init__(self, topics: list[Channel], recording: Recorder) -> None:
         # Here, because these imports take seconds, which the other half of the runs does not need.
-        from app.robot.address import parse_address
         from app.robot.source import LiveSource
+        from app.sources.live_address import parse_address
         from pipeline.io.readers import SourceOptions
         from tests.app.robot.test_live_session import URI, FakeLink, announce
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from app.robot.address import ZenohAddress, parse_address
 from app.robot.source import LiveSource, open_live
 from app.robot.zenoh import configuration, data_key
+from app.sources.live_address import ZenohAddress, parse_address
 from pipeline.errors import SourceError
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.recording import messages

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from app.batch.tree_pictures import keep_pictures
-from app.robot.address import parse_address
 from app.robot.link import (
     LARGEST_PICTURE,
     MAX_PICTURE_BYTES,
@@ -23,6 +22,7 @@ from app.robot.link import (
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource, PictureStore
 from app.robot.topics import PICTURE_TYPES, Publisher, choose
+from app.sources.live_address import parse_address
 from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
 from pipeline.io.block_file import SPARE_BYTES

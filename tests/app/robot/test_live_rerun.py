@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from app.robot.address import parse_address
 from app.robot.source import LiveSource
+from app.sources.live_address import parse_address
 from app.worker.process import new_session
 from app.worker.protocol import Open
 from pipeline.config import Parameters

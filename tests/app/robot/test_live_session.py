@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from app.robot.address import ZenohAddress, parse_address
 from app.robot.link import Inbox, Link
 from app.robot.source import LiveSource
 from app.robot.topics import Publisher
+from app.sources.live_address import ZenohAddress, parse_address
 from app.worker.loop import WorkerLoop
 from app.worker.protocol import Advance, Begin, FromWorker, Open, Opened, Pause, Report, Seek, Shown, ToWorker
 from app.worker.session import Session

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_address
 from app.robot.link import MAX_BYTES, MAX_OTHERS, MAX_SCANS, SKIPPED, TOO_MANY, Inbox, Link
 from app.robot.topics import Publisher, choose
 from app.robot.velodyne import VelodyneLink
 from app.robot.zenoh import ZenohLink, data_key, publisher_of
+from app.sources.live_address import VelodyneAddress, ZenohAddress, is_live, parse_address
 from pipeline.errors import SourceError
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.topics import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS

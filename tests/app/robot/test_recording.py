@@ -17,10 +17,10 @@ from mcap.reader import make_reader
 from app.batch.map_run import OfflineRun, map_run
 from app.cli import main
 from app.robot import recorder as recorder_module
-from app.robot.address import parse_address
 from app.robot.link import SKIPPED
 from app.robot.recorder import NOT_RECORDED, RawFile, Recorder
 from app.robot.source import LiveSource
+from app.sources.live_address import parse_address
 from app.worker.run import recorded_parameters
 from pipeline.config import Parameters
 from pipeline.errors import SourceError

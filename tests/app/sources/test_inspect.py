@@ -14,10 +14,11 @@ import pytest
 
 from app.common.child_process import ChildProcess
 from app.common.settings import Settings
+from app.dashboard import inspection_process
 from app.robot.link import Inbox
 from app.robot.source import open_any
 from app.robot.topics import Publisher
-from app.sources import inspection_process, opening
+from app.sources import opening
 from app.sources.opening import ask, check_source
 from app.sources.request import SourceRequest
 from app.worker.protocol import Open

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from app.explain.build import cluster_story, tree_story
 from app.explain.build import section as at_breast
 from app.extensions.clouds.inventory import PARAMETERS
+from app.worker.one_step_run import OneStepRun
 from app.worker.outbox import picture_of
 from app.worker.process import new_session, open_any_or_one_step
 from app.worker.protocol import Open, Report, Shown, from_worker
@@ -59,6 +59,11 @@ def again(session: Session) -> Frame:
         session.remap()
     assert session.frame is not None
     return session.frame
+
+
+def cloud_run(session: Session) -> OneStepRun:
+    assert isinstance(session.run, OneStepRun)
+    return session.run
 
 
 def test_a_cloud_is_mapped_in_steps_without_a_robot(session: Session) -> None:
@@ -159,7 +164,7 @@ def test_other_parameters_do_not_map_the_cloud_again(session: Session) -> None:
 def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session: Session) -> None:
     frame = mapped(session)
     for row, number in enumerate(frame.trees.number.tolist()):
-        story = tree_story(session.run, session.frame, number)
+        story = cloud_run(session).tree_story(number)
         stem = story.further["clouds"]
         assert len(stem.sections) == frame.trees.observations[row]
         heights = [section.height for section in stem.sections]
@@ -177,7 +182,7 @@ def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session
         assert np.isnan(stem.height) == bool(stem.height_hidden)
         assert stem.height_hidden or stem.height == pytest.approx(8.0, abs=4.0 * stem.height_sigma)
     with pytest.raises(StemmapError, match="no tree 99"):
-        tree_story(session.run, session.frame, 99)
+        cloud_run(session).tree_story(99)
 
 
 def test_the_section_at_breast_height_shows_each_stem(session: Session) -> None:
@@ -196,7 +201,7 @@ def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(sessio
     frame = mapped(session)
     others = 0
     for row in range(len(frame.clusters.verdict)):
-        story = cluster_story(session.run, frame, row)
+        story = cloud_run(session).cluster_story(row)
         assert story.verdict == Verdict(int(frame.clusters.verdict[row])).label
         failed = [check.verdict for check in story.checks if check.fails]
         if story.verdict == "tree":
@@ -209,7 +214,7 @@ def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(sessio
         assert (story.tree is not None) == (story.verdict == "tree")
     assert others == 3, "bushes"
     with pytest.raises(StemmapError, match="no cluster"):
-        cluster_story(session.run, frame, len(frame.clusters.verdict))
+        cloud_run(session).cluster_story(len(frame.clusters.verdict))
 
 
 def test_two_sets_are_compared_without_a_change_of_the_map(session: Session) -> None:

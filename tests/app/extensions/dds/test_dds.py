@@ -14,8 +14,8 @@ import pytest
 
 from app.extensions.dds.address import DdsAddress
 from app.extensions.dds.link import Offer, common_offer, offer_of
-from app.robot.address import parse_address
 from app.robot.source import LiveSource
+from app.sources.live_address import parse_address
 from pipeline.errors import SourceError
 from pipeline.io.readers.topics import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
 from pipeline.types.records import Odometry, Record, Scan

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 from app.extensions.fleet.fleet import RobotWatch, robots_at, watched_router
-from app.robot.address import ZenohAddress, parse_address
+from app.sources.live_address import ZenohAddress, parse_address
 from app.worker.protocol import Open
 from tests.app.extensions.fleet.test_fleet import make
 from tests.app.robot.conftest import Robot, free_port, until

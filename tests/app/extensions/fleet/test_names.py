@@ -7,8 +7,8 @@ import asyncio
 import pytest
 
 from app.extensions.fleet.fleet import NAMELESS, RobotWatch, address_of, recorded_apart
-from app.robot.address import ROOT, ZenohAddress, parse_address
 from app.robot.topics import Publisher, choose
+from app.sources.live_address import ROOT, ZenohAddress, parse_address
 from app.worker.protocol import Open
 from pipeline.io.readers.topics import POINT_CLOUD
 from tests.app.extensions.fleet.test_fleet import make

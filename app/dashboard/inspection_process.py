@@ -1,4 +1,4 @@
-"""The child process that inspects files and robots from outside: `python -m app.sources.inspection_process`.
+"""The child process that inspects files and robots: `python -m app.dashboard.inspection_process`.
 
 `app.sources.opening.ask` starts it and asks one of `QUESTIONS`.
 """
@@ -17,10 +17,10 @@ from typing import Any
 import msgspec
 
 from app.common.child_process import ParentConnection, run_child
-from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
+from app.sources.live_address import is_live, parse_address
 from app.sources.one_step import is_one_step, open_one_step
 from app.sources.opening import MEMORY_LIMIT, open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
