@@ -3,7 +3,7 @@ scenario does, turns at up to 60 degrees/s and stands for 10 s."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -72,9 +72,10 @@ def lidar_drive(
     return SimulatedSource(f"sim:{name}?seed={seed}", run)
 
 
-def lidar_records(source: SimulatedSource, *, imu: bool = False) -> Iterator[Record]:
-    """Yield the scans of a run, with the readings of the IMU on request, and no odometry."""
-    for record in source.records():
+def lidar_records(records: Iterable[Record], *, imu: bool = False) -> Iterator[Record]:
+    """Yield the scans among the records of a run, with the readings of the IMU on request, and no
+    odometry."""
+    for record in records:
         if not isinstance(record, Odometry) and (imu or not isinstance(record, Imu)):
             yield record
 

@@ -10,9 +10,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from tests.benchmarks.seeds import chosen_seeds
 from tests.benchmarks.table import Cell, Table
+
+if TYPE_CHECKING:
+    from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.types.records import Record
 
 NAME = "lidar_only"
 LINE = "Drift of the path and trees of drives without wheels and IMU, seeds 0 to 9 of four stands"
@@ -43,11 +48,15 @@ def run() -> list[Table]:
     """All stands and seeds."""
     import numpy as np
 
+    from tests.benchmarks.lidar_drives import lidar_drive
+
     rows, drifts, apart, silent = list[tuple[Cell, ...]](), list[float](), list[float](), 0
     for scene in SCENES:
         for seed in chosen_seeds(SEEDS):
             speed, one_way = (SLOW if seed % 2 else FAST), seed % 4 >= 2
-            alone, wheels = (_mapped(scene, seed, speed, one_way, alone=alone) for alone in (True, False))
+            source = lidar_drive(scene, seed, speed, DURATION_S, one_way=one_way)
+            records = list(source.records())
+            alone, wheels = (_mapped(source, records, alone=alone) for alone in (True, False))
             drift = 100.0 * alone.largest / max(alone.way, SHORTEST)
             gaps = (wheels.completeness - alone.completeness, wheels.correctness - alone.correctness)
             drifts.append(drift)
@@ -75,8 +84,8 @@ def run() -> list[Table]:
     return [Table(LINE, columns, tuple(rows), notes)]
 
 
-def _mapped(scene: str, seed: int, speed: float, one_way: bool, *, alone: bool) -> Drive:
-    """Map a drive, by the LiDAR alone or with wheels and IMU."""
+def _mapped(source: SimulatedSource, records: Iterable[Record], *, alone: bool) -> Drive:
+    """Map the records of a drive, by the LiDAR alone or with wheels and IMU."""
     import numpy as np
 
     from pipeline.config import preset
@@ -84,17 +93,14 @@ def _mapped(scene: str, seed: int, speed: float, one_way: bool, *, alone: bool) 
     from pipeline.mapper import Mapper
     from pipeline.odometry.lidar_odometry import LidarOdometry
     from pipeline.odometry.synchroniser import steps
-    from pipeline.types.records import Record
-    from tests.benchmarks.lidar_drives import lidar_drive, lidar_records
+    from tests.benchmarks.lidar_drives import lidar_records
 
-    source = lidar_drive(scene, seed, speed, DURATION_S, one_way=one_way)
     about, truth, parameters = source.description, source.truth(), preset("forest")
     assert truth.trees is not None
     assert truth.path is not None
-    records: Iterable[Record] = source.records()
     if alone:
         motion = LidarOdometry(about.T_base_lidar, about.sensor)
-        records = (told for record in lidar_records(source) for told in motion.add(record))
+        records = (told for record in lidar_records(records) for told in motion.add(record))
     mapper = Mapper(parameters, sensor=about.sensor, T_base_lidar=about.T_base_lidar, seed=0)
     warnings = set[str]()
     frames = (mapper.process(step) for step in steps(records))
