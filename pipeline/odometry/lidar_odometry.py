@@ -10,7 +10,7 @@ direction in which the normals of a scan vary least (`vertical_of`). It levels t
 
 Rings on the ground move with the sensor and pull the pose backwards, so the points above the ground determine
 x, y and yaw. Where the view leaves the trees, they are few and their registration ends in a false minimum.
-So it is weighted with that of the whole cloud (`_fused`).
+So it is weighted with that of the whole cloud (`fused`).
 
 A registration gives the pose of a scan in the middle of its sweep: an error of the velocity with which the
 scan was de-skewed moves the points before and after the middle in opposite directions. De-skewed to another
@@ -259,7 +259,7 @@ class LidarOdometry:
             span_s = (middle_ns - before_ns) * 1e-9
             largest = np.array([FASTEST, FASTEST, FASTEST_TURN]) * span_s
             of_scan, disagreement = self._covariance(upright, above, largest)
-            T = _fused(T, above, of_scan)
+            T = fused(T, above, of_scan)
             self._disagreement += (disagreement - self._disagreement) * min(span_s * 1e9 / LOST_NS, 1.0)
             of_scan *= max(self._disagreement / 3.0, 1.0)
             if (np.diag(of_scan) < SHOWN).all():
@@ -474,7 +474,7 @@ def _planar_of(T: Float, planar: Float) -> Float:
     return combined
 
 
-def _fused(whole: Float, above: Float, covariance: Float) -> Float:
+def fused(whole: Float, above: Float, covariance: Float) -> Float:
     """Return the mean of two poses that differ in x, y and yaw, weighted by their inverse covariances: WHOLE
     of the whole cloud, and that of the points above the ground, shape (3, 3); the first pose if they
     contradict each other (CONTRADICTED). Poses have the shape (4, 4)."""

@@ -16,10 +16,13 @@ from pipeline.geometry.poses import Float, Pose2, Pose3, wrap_angle
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.odometry.lidar_odometry import (
+    CONTRADICTED,
     FINEST,
     LOST,
     VOXEL,
+    WHOLE,
     LidarOdometry,
+    fused,
     levelling,
     scaled,
     undistorted,
@@ -270,6 +273,51 @@ def test_an_open_field_shows_no_motion_and_is_told():
         if isinstance(r, Odometry) and r.covariance is not None
     ]
     np.testing.assert_allclose(np.linalg.norm(sigma, axis=0)[:2], 0.35, rtol=0.01)  # 0.5 m/s for 0.7 s
+
+
+def grass(rng: np.random.Generator, lidar: float, height: float, depth: float) -> Float:
+    """Points of a VLP-16 at a height above the ground in grass [m], whose blades end the rays after `depth`
+    in the mean [m]."""
+    down, azimuth = np.meshgrid(np.radians(np.arange(1.0, 16.0, 2.0)), np.arange(-np.pi, np.pi, 0.007))
+    within = rng.exponential(depth, down.shape)
+    reach = np.minimum((lidar - min(height, lidar)) / np.sin(down) + within, lidar / np.sin(down))
+    level = reach * np.cos(down)
+    points = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), -reach * np.sin(down)], axis=-1)
+    near: Float = points[reach < 40.0] + rng.normal(0.0, 0.02, (np.count_nonzero(reach < 40.0), 3))
+    return near
+
+
+@pytest.mark.parametrize(("lidar", "height", "depth"), [(0.8, 0.6, 1.0), (1.0, 1.2, 1.0)])
+def test_grass_without_trees_shows_no_motion_and_is_told(lidar: float, height: float, depth: float):
+    """Other blades return the rays of each scan, so each scan fits to those before."""
+    rng = np.random.default_rng(3)
+    motion = LidarOdometry(Pose3.identity())
+    scans = [
+        Scan((k + 1) * PERIOD_NS, grass(rng, lidar, height, depth).astype(np.float32)) for k in range(28)
+    ]
+    notices = [r.text for scan in scans for r in motion.add(scan) if isinstance(r, Notice)]
+    assert len(notices) == 1
+    assert notices[0].startswith(f"{LOST} since 0.")
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-0.05, 0.05), st.floats(0.001, 10.0))
+def test_registrations_of_a_scan_are_weighted_and_the_whole_cloud_is_kept_where_they_contradict(
+    x: float, y: float, yaw: float, scale: float
+):
+    whole = np.eye(4)
+    whole[:3, :3], whole[:3, 3] = Pose3.from_euler(np.zeros(3), 0.1, -0.2, 0.7).R, (1.0, 2.0, 3.0)
+    above = whole.copy()
+    turn = Pose3.from_euler(np.zeros(3), 0.0, 0.0, yaw)
+    above[:3, :3], above[:2, 3] = turn.R @ whole[:3, :3], whole[:2, 3] + (x, y)
+    found = fused(whole, above, scale * WHOLE)
+    d = np.linalg.inv(whole) @ above
+    apart = np.array([d[0, 3], d[1, 3], np.arctan2(d[1, 0], d[0, 0])])
+    contradicted = apart @ np.linalg.solve((1.0 + scale) * WHOLE, apart) > CONTRADICTED
+    share = 0.0 if contradicted else 1.0 / (1.0 + scale)
+    np.testing.assert_allclose(found[:2, 3], whole[:2, 3] + share * np.array([x, y]), atol=0.03)
+    np.testing.assert_allclose(found[2], whole[2], atol=1e-9)  # height and tilt are those of the whole cloud
+    turned = Pose3(found[:3, :3], found[:3, 3]).euler()[2] - 0.7
+    assert abs(turned - share * yaw) < 0.005
 
 
 def test_a_place_after_a_gap_is_told_and_the_map_begins_anew():
