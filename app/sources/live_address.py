@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import ClassVar
 from urllib.parse import parse_qsl
 
-from app.extension import extensions_on
+from app.extension import all_extensions, switched_off
 from pipeline.errors import SourceError
 
 #: Value of `?robot=` for all robots, each with a dashboard.
@@ -83,7 +83,7 @@ class VelodyneAddress(Address):
 
 def is_live(uri: str) -> bool:
     """Return whether a URI is the address of a live source: whether it begins with one of the schemes, in any
-    case. It is not checked further."""
+    case. It is not checked further. Raises SourceError if the extension of a scheme is switched off."""
     return uri.lower().startswith((SCHEME, VELODYNE)) or _module_of(uri) != ""
 
 
@@ -95,10 +95,18 @@ def extension_of(uri: str) -> ModuleType | None:
 
 
 def _module_of(uri: str) -> str:
-    """Return the name of the module of `extension_of`; "" for none."""
+    """Return the name of the module of `extension_of`; "" for none. Raises SourceError if the extension is
+    switched off."""
     scheme = uri.partition(":")[0].lower()
-    found = (each.addresses[scheme] for each in extensions_on().values() if scheme in each.addresses)
-    return next(found, "")
+    for each in all_extensions():
+        if each.extension is None or scheme not in each.extension.addresses:
+            continue
+        if not each.is_on:
+            raise SourceError(
+                "this kind of address needs an extension", where=uri, remedy=switched_off(each.name)
+            )
+        return each.extension.addresses[scheme]
+    return ""
 
 
 def parse_address(uri: str) -> Address:

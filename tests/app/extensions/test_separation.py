@@ -124,3 +124,16 @@ async def test_the_core_needs_no_extension(off: str, monkeypatch: pytest.MonkeyP
         for file in ("/api/trees.csv", "/api/export/geojson", "/api/export/gpkg"):
             exported = await client.get(file)
             assert (exported.status_code, len(exported.content) > 100) == (200, True), exported.text
+
+
+def test_what_needs_an_extension_that_is_switched_off_says_which(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv(VARIABLE, "")
+    cloud = tmp_path / "plot.xyz"
+    cloud.write_text("1 2 3\n4 5 6\n7 8 9\n")
+    for extension, words in {
+        "dds": ("serve", "dds:?domain=0", "--no-browser"),
+        "clouds": ("map", cloud, "--as", "cloud", "--out", tmp_path / "out"),
+        "stand": ("stand", tmp_path),
+    }.items():
+        assert main([str(word) for word in words]) in (1, WRONG_USAGE)
+        assert f"extension {extension} is switched off by STEMMAP_EXTENSIONS" in capsys.readouterr().err
