@@ -49,7 +49,8 @@ LOCAL_WKT = (
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A column of an exported layer: name, name in a Shapefile (at most 10 characters), unit, meaning."""
+    """A column of an exported layer: name, short name for formats with at most 10
+    characters, unit, meaning."""
 
     name: str
     short: str
@@ -203,8 +204,8 @@ def export_run(run: R, file: FilePath, writers: Mapping[str, Writer[R]]) -> list
 
 
 def export_bytes(run: R, suffix: str, writers: Mapping[str, Writer[R]]) -> tuple[bytes, str]:
-    """Return the bytes of an exported file and its name, such as trees.gpkg. Several files, as of a
-    Shapefile, are one zip archive (trees_shp.zip) of the files of `export_run`.
+    """Return the bytes of an exported file and its name, such as trees.gpkg. Several files are one
+    zip archive of the files of `export_run`, such as trees_shp.zip.
 
     Args:
         run: The run.

@@ -118,13 +118,10 @@ def calm(dashboard: Dashboard) -> Iterator[None]:
 
 
 @pytest.fixture
-def on_plots(chromium: Browser, server: Server) -> Iterator[Dashboard]:
-    """The tab Plots with the whole map of a run that stands, without annotations."""
+def mapped(chromium: Browser, server: Server) -> Iterator[Dashboard]:
+    """The whole map of a run that stands, without annotations."""
     with opened(chromium, server.link) as dashboard:
         dashboard.reset()
         dashboard.stand()
         dashboard.until_server("/api/trees", "it.trees.length > 20")
-        dashboard.tab("Plots")
-        dashboard.page.get_by_role("button", name="Fit").click()
-        dashboard.drawn()
         yield dashboard

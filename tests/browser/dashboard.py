@@ -194,6 +194,10 @@ class Dashboard:
         self.page.get_by_role("tab", name=name).click()
         return self.page.locator(f"#panel-{name.lower()}")
 
+    def tabs(self) -> list[str]:
+        """Names of all tabs, also of those of extensions."""
+        return self.page.locator(".tabs [role=tab]").all_inner_texts()
+
     def card_shown(self) -> None:
         """Wait until the review card shows the selected tree; until then the review takes no answer."""
         self.until("() => document.getElementById('review').getAttribute('aria-busy') === 'false'")

@@ -20,7 +20,7 @@ from tests.browser.dashboard import FEW_FRAMES, Dashboard
 from tests.browser.film import NOTICE_WAS_SHOWN, stand_at
 from tests.browser.flags import FLAGS
 from tests.browser.serving import Server
-from tests.browser.test_accessibility import DIALOGS, OVERLAYS, TABS, THEMES
+from tests.browser.test_accessibility import DIALOGS, OVERLAYS, THEMES
 
 # A desk, a small desk, a tablet, a phone, and 1600 x 900 at a zoom of 200 %.
 SIZES = {"1600": (1600, 900), "1280": (1280, 720), "820": (820, 1180), "390": (390, 844), "zoom": (800, 450)}
@@ -106,7 +106,7 @@ def survey_run(browser: Browser, link: str, folder: Path, size: str, wanted: lis
         page.locator("#drawer-button").click()
     page.locator("#trees tbody tr").nth(4).click()
     page.locator("#panel-story[data-story^=tree]").wait_for()
-    for tab in TABS:
+    for tab in dashboard.tabs():
         name = f"tab-{tab.lower()}"
         survey.picture_of(name, lambda tab=tab: dashboard.tab(tab), lambda: None)  # type: ignore[misc]
     dashboard.tab("Annotate")
@@ -138,7 +138,7 @@ def survey_run(browser: Browser, link: str, folder: Path, size: str, wanted: lis
 
 
 def survey_runs(survey: Survey, link: str) -> None:
-    """The page of all runs, a run, two runs compared, and the report of a run."""
+    """The page of all runs, and a run."""
     page = survey.page
     page.goto(link.split("?")[0] + "runs")
     page.locator("#runs tbody tr").first.wait_for()

@@ -115,7 +115,6 @@ def test_actions_are_found_and_executed(dashboard: Dashboard):
     ("word", "found"),
     [
         ("annotate", "Tab Annotate"),
-        ("plot", "Tab Plots"),
         ("help", "Settings and keyboard shortcuts"),
         ("zoom", "Zoom in on the map"),
         ("delete", "Annotate: delete the chosen annotation"),

@@ -81,7 +81,7 @@ def test_an_unknown_review_is_refused(tmp_path):
         read_run(folder)
 
 
-def test_commands_use_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
+def test_an_export_has_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path / "kept"))
     folder = grid_run(tmp_path / "run")
     run = read_run(folder)
@@ -90,17 +90,12 @@ def test_commands_use_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
     number = store.open_run(run.record["source"].get("sha256") or run.uri, run.uri, "grid")
     store.add(number, Author("a" * 16, "Ann"), [Content(x, y, "pole")])
     store.close()
-    result = stemmap(capsys, "stand", folder, "--out", tmp_path / "out")
-    assert (result.code, result.err) == (0, "review: 1 tree rejected on the page left out\n")
-    assert json.loads((tmp_path / "out" / "stand.json").read_text())["trees_left_out"]["rejected"] == 1
-    assert "99 trees from 7 cm" in result.out
     exported = tmp_path / "trees.geojson"
-    stemmap(capsys, "export", folder, "--to", exported)
+    result = stemmap(capsys, "export", folder, "--to", exported)
+    assert (result.code, result.err) == (0, "review: 1 tree rejected on the page left out\n")
     features = json.loads(exported.read_text())["features"]
     assert {each["properties"]["review"] for each in features} == {"open"}
     assert len(features) == 99
-    stemmap(capsys, "report", folder, "--out", tmp_path / "report.html")
-    assert "1 rejected in the review" in (tmp_path / "report.html").read_text()
 
 
 @pytest.mark.parametrize("was_reviewed_here", [False, True])
@@ -118,6 +113,6 @@ def test_reviews_in_the_files_count_until_the_recording_is_annotated_here(
             author = Author("a" * 16, "Ann")
             store.add(number, author, [Content(1.0, 1.0, "pole")])
             store.undo(number, author)
-    stemmap(capsys, "stand", folder, "--out", tmp_path / "out")
-    left_out = json.loads((tmp_path / "out" / "stand.json").read_text())["trees_left_out"]
-    assert left_out["rejected"] == (0 if was_reviewed_here else 1)
+    exported = tmp_path / "trees.geojson"
+    stemmap(capsys, "export", folder, "--to", exported)
+    assert len(json.loads(exported.read_text())["features"]) == (100 if was_reviewed_here else 99)

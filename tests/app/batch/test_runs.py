@@ -1,4 +1,4 @@
-"""What became of the runs, through the API: recorded, listed, compared, renamed, deleted, played again."""
+"""What became of the runs, through the API: recorded, listed, renamed, deleted, played again."""
 
 from __future__ import annotations
 
@@ -18,16 +18,14 @@ from app.common.settings import Settings
 from app.dashboard import run_recorder
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
-from app.dashboard.shown_run import ShownRun
 from app.sources import opening
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.database import maps
 from app.store.records import Author, Content
 from app.store.store import Store
-from app.worker.protocol import Begin, Open, Shown, View
+from app.worker.protocol import Begin, Open, Shown
 from pipeline.errors import SourceError, StemmapError
 from pipeline.types.records import TruthTrees
-from tests.app.batch.finished_runs import write_run
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
 
@@ -162,7 +160,6 @@ async def test_a_run_that_is_not_there(both: Running, key: str) -> None:
     client, _ = both
     assert (await client.get(f"/api/runs/{key}")).status_code == 404
     assert (await client.post(f"/api/runs/{key}/replay")).status_code == 404
-    assert (await client.get("/api/runs/compare", params={"a": key, "b": key})).status_code == 404
 
 
 async def test_a_run_is_played_again_with_its_parameters(both: Running) -> None:
@@ -306,74 +303,6 @@ async def test_from_afar_a_run_of_a_hidden_file_is_not_opened() -> None:
         assert (await client.post(f"/api/runs/{row['key']}/replay")).status_code == 403
 
 
-async def test_two_runs_of_one_recording_are_compared(both: Running) -> None:
-    client, dashboard = both
-    await play(dashboard, n_trees=4)
-    await client.patch("/api/parameters", json={"changes": {"clustering.eps": 0.4}})
-    await play(dashboard, n_trees=5, run=2)
-    new, old = (row["key"] for row in await runs(client))
-    told = (await client.get("/api/runs/compare", params={"a": old, "b": new})).json()
-    assert told["how"] == "same recording"
-    assert [(row["tree_a"], row["tree_b"], row["shift_m"]) for row in told["rows"]] == [
-        (1, 1, 0),
-        (2, 2, 0),
-        (3, 3, 0),
-        (None, 4, None),
-    ]
-    assert told["record"]["counts"]["same"] == 3
-    assert told["parameters"] == [{"name": "clustering.eps", "a": 0.15, "b": 0.4}]
-
-
-async def test_two_visits_are_those_of_the_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Two folders in frames of their own: a tree has grown, one is gone, one is new."""
-    from app.cli import main
-
-    rng = np.random.default_rng(3)
-    there = rng.uniform(1, 19, (24, 2))
-    c, s = np.cos(0.7), np.sin(0.7)
-    here = (there - [3.0, -2.0]) @ np.array([[c, -s], [s, c]])
-    dbh = rng.uniform(0.15, 0.45, 24)
-    grown = dbh.copy()
-    grown[5] += 0.05
-    folder = tmp_path / "recordings"
-    write_run(folder / "first", there[1:], dbh[1:], dbh_sigma=0.004, numbers=range(2, 25))
-    write_run(folder / "second", here[:-1], grown[:-1], dbh_sigma=0.004, side=20.0)
-    paths = [str(folder / name) for name in ("first", "second")]
-    assert await asyncio.to_thread(main, ["compare", *paths, "--out", str(tmp_path / "out")]) == 0
-    async with running(Settings(folder=tmp_path)) as (client, _):
-        client.headers.update(BEARER)
-        query = {"a": "folder:first", "b": "folder:second"}
-        run = folder / "second" / "run.json"
-        run.write_text(run.read_text().replace('"sha256": "00"', '"sha256": "01"'))
-        told = (await client.get("/api/runs/compare", params=query)).json()
-    assert told["how"] == "aligned by 22 stems"
-    np.testing.assert_allclose(told["pose"], [3.0, -2.0, 0.7], atol=0.02)
-    assert told["csv"] == (tmp_path / "out" / "comparison.csv").read_text()
-    assert [row["tree_a"] for row in told["rows"] if row["significant"]] == [6]
-    assert (told["record"]["pairs"], told["record"]["significant"]) == (22, 1)
-    np.testing.assert_allclose(told["places_b"]["6"], there[5], atol=0.02)
-
-
-async def test_maps_that_do_not_fit_are_compared_without_alignment(tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
-    write_run(folder / "few", [[1.0, 1.0]], [0.2])
-    write_run(folder / "none", np.zeros((0, 2)), [])
-    write_run(folder / "other", [[1.3, 1.0], [9.0, 9.0]], [0.2, 0.3])
-    for k, name in enumerate(("few", "none", "other")):
-        run = folder / name / "run.json"
-        run.write_text(run.read_text().replace('"sha256": "00"', f'"sha256": "{k}"'))
-    async with running(Settings(folder=tmp_path)) as (client, _):
-        client.headers.update(BEARER)
-        for a, b, statuses in (("few", "other", ["same", "new"]), ("none", "few", ["new"])):
-            query = {"a": f"folder:{a}", "b": f"folder:{b}"}
-            told = (await client.get("/api/runs/compare", params=query)).json()
-            assert told["how"].startswith("not aligned: the stems of the two visits do not agree")
-            assert not told["aligned"]
-            assert [row["status"] for row in told["rows"]] == statuses
-
-
 async def test_a_finished_folder_in_the_data_folder_is_listed_and_read(tmp_path: Path) -> None:
     from app.cli import main
 
@@ -420,45 +349,3 @@ def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:
     assert len(thin) == MOST_PATH_POINTS
     assert (thin[0], thin[-1]) == ([0.0, 0.0], [9999.0, 0.0])
     assert thinned(xy[:0]) == []
-
-
-async def test_the_report_of_a_run_is_that_of_the_command_line(both: Running, tmp_path: Path) -> None:
-    """Of the open run, and of a run in the list, which keeps its result files."""
-    from app.extensions.stand.plot_files import plots_of_run
-    from app.extensions.stand.report import report_page
-
-    client, dashboard = both
-    assert (await client.get("/api/runs/open/report/html")).status_code == 409
-    await play(dashboard)
-    assert dashboard.path is not None
-    for stamp in dashboard.path.stamp_ns.tolist():
-        await dashboard.receive(View(1, stamp, np.full(360, 8.0)))
-    await show(dashboard, 3, 4)
-    shape = {"kind": "circle", "x": 1.0, "y": 1.0, "radius": 3.0}
-    run = (await client.get("/api/annotations")).json()["run"]
-    body = {"run": run, "browser": "a" * 16, "who": "Ann", "plots": [{"name": "north", "shape": shape}]}
-    assert (await client.post("/api/plots", json=body)).status_code == 201
-
-    reply = await client.get("/api/runs/open/report/html?language=de&volume=0.001*dbh_cm^2")
-    assert reply.status_code == 200, reply.text
-    assert reply.headers["content-disposition"] == 'attachment; filename="report.html"'
-    page = reply.text
-    assert "Bestandesbericht" in page
-    assert "north" in page
-    assert "Stammvolumen je Hektar" in page
-    english = (await client.get("/api/runs/open/report/html")).text
-    assert "What was left out" not in english  # only `stemmap map` counts it
-    with ShownRun.of(dashboard).folder() as folder:
-        assert english == report_page(folder, plots=plots_of_run(ShownRun.of(dashboard)))
-
-    key = next(row["key"] for row in await runs(client))
-    assert (await client.get(f"/api/runs/{key}/report/html")).text == english
-    await play(dashboard, "other:", run=2)
-    async with asyncio.timeout(20):  # the files are written in the background
-        while (stored := await client.get(f"/api/runs/{key}/report/html")).status_code == 409:
-            assert "without its result files" in stored.text
-            await asyncio.sleep(0.05)
-    assert (stored.status_code, stored.text == english) == (200, True)
-    assert (await client.get("/api/runs/999/report/html")).status_code == 404
-    assert (await client.get("/api/runs/folder:none/report/html")).status_code == 404
-    assert (await client.get(f"/api/runs/{key}/report/html?language=xx")).status_code == 422

@@ -6,17 +6,20 @@ import laspy
 import numpy as np
 import pytest
 
+from app.batch.map_frame import MapFrame, write_map_frame
 from app.batch.run_folder import read_run
 from app.dashboard.inspection_process import cloud
 from app.sources.opening import open_cloud
 from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Pose2
 from tests.app.cli.test_commands import stemmap
 
 
 def test_the_cloud_of_a_drive_has_its_trees_and_its_ground(tmp_path, capsys):
     run = tmp_path / "run"
     assert stemmap(capsys, "map", "sim:stand?duration=6", "--out", run).code == 0
-    stemmap(capsys, "georeference", run, "--by-hand", "500000,5300000,90,400", "--crs", "EPSG:25832")
+    frame = MapFrame("EPSG:25832", Pose2(500_000.0, 5_300_000.0, np.pi / 2), 400.0, "hand")
+    write_map_frame(run, frame.record())
     result = stemmap(capsys, "export", run, "--to", tmp_path / "cloud.laz")
     assert result.code == 0, result.err
     cloud = laspy.read(tmp_path / "cloud.laz")

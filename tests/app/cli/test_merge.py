@@ -109,7 +109,6 @@ def test_the_terrain_of_both_runs_is_written_and_read_again(runs, tmp_path, caps
     }
     assert cells["a"] < cells["both"]
     assert main(["export", str(runs / "both"), "--out", str(tmp_path / "gis")]) in (0, 3)
-    assert main(["report", str(runs / "both"), "--out", str(tmp_path / "report.html")]) == 0
     capsys.readouterr()
 
 

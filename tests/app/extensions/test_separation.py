@@ -28,7 +28,9 @@ WORDS = {
     "fleet": r"fleet|robots-link|common.map",
     "formats": r"victoria",
     "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
-    "stand": r"stand_figures",
+    # georeference.json has the reference system of a map, which the core reads for its files.
+    "stand": r"sample.?plot|stand.figure|georeferenc(?!e\.json)|/api/plots|runs/compare|[a-z]-plots\b|\bplots-|"
+    r"\"Plots\"|tab Plots|plot-form|report_page|stemmap (stand|report|compare)\b|shapefile|\bdxf\b|xlsx|two visits",
     "learning": r"learning|\blearn-|stemmap train\b|\"train\"|Learn:",
 }
 NAMES = sorted(WORDS)
@@ -61,7 +63,12 @@ def test_only_its_own_files_name_an_extension(name):
 
 @pytest.mark.parametrize(
     ("words", "name"),
-    [("tune sim:stand", "search"), ("train", "learning"), ("evaluate sim:stand --param-grid x=1", "search")],
+    [
+        ("tune sim:stand", "search"),
+        ("train", "learning"),
+        ("report DIR", "stand"),
+        ("evaluate sim:stand --param-grid x=1", "search"),
+    ],
 )
 def test_what_is_switched_off_is_named(words: str, name: str, monkeypatch: pytest.MonkeyPatch, capsys):
     monkeypatch.setenv(VARIABLE, "")

@@ -10,12 +10,21 @@ from playwright.sync_api import Browser, expect
 from tests.browser.conftest import opened_by_another
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
+from tests.browser.test_accessibility import in_both_themes
 from tests.browser.test_annotate import place_of
 
 
 @pytest.fixture
-def person(on_plots: Dashboard) -> Dashboard:
-    return on_plots
+def person(mapped: Dashboard) -> Dashboard:
+    return shown_plots(mapped)
+
+
+def shown_plots(dashboard: Dashboard) -> Dashboard:
+    """The dashboard with the tab Plots and the whole map."""
+    dashboard.tab("Plots")
+    dashboard.page.get_by_role("button", name="Fit").click()
+    dashboard.drawn()
+    return dashboard
 
 
 def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
@@ -134,3 +143,12 @@ def test_viewers_see_plots_and_cannot_change_them(
         assert viewer.page.locator("#plots-edit").evaluate("node => node.inert")
     page.locator("#plot-undo").click()
     expect(rows).to_have_count(0)
+
+
+def test_a_plot_in_the_list_has_no_violation_and_no_text_that_cannot_be_read(person: Dashboard) -> None:
+    page = person.page
+    page.emulate_media(reduced_motion="reduce")  # colours change at once
+    page.get_by_text("Type a plot").click()
+    page.locator(".plot-form").first.get_by_role("button", name="Add").click()
+    expect(page.locator("#plots-table tr[data-plot]")).to_have_count(1)
+    assert in_both_themes(page, "#panel-plots") == []

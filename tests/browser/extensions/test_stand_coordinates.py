@@ -11,14 +11,15 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
+from tests.browser.extensions.test_stand_plots import shown_plots
 from tests.browser.test_annotate import place_of
 
 EAST, NORTH = 500000.0, 5300000.0
 
 
 @pytest.fixture
-def person(on_plots: Dashboard) -> Dashboard:
-    return on_plots
+def person(mapped: Dashboard) -> Dashboard:
+    return shown_plots(mapped)
 
 
 def far_from_trees(person: Dashboard) -> tuple[float, float]:
