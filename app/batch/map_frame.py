@@ -58,8 +58,8 @@ class MapFrame:
             already in it), "hand", "control" (points) or "gnss" (fixes); "" if unknown.
         numbers: Dict from the names in METHOD_NUMBERS to the numbers of the method; empty for "cloud", "file"
             and "hand".
-        sigma: Standard deviation of a position in the reference system, at the centre of its points [m]; NaN if
-            unknown.
+        sigma: Standard deviation of a position in the reference system, at the centre of its points [m]; NaN
+            if unknown.
         residuals: Name and residual east, north [m] of each control point.
         place: The reference system and the place of the map in it, see `place_words`; "" if unknown.
     """

@@ -29,8 +29,9 @@ WORDS = {
     "formats": r"victoria",
     "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
     # georeference.json has the reference system of a map, which the core reads for its files.
-    "stand": r"sample.?plot|stand.figure|georeferenc(?!e\.json)|/api/plots|runs/compare|[a-z]-plots\b|\bplots-|"
-    r"\"Plots\"|tab Plots|plot-form|report_page|stemmap (stand|report|compare)\b|shapefile|\bdxf\b|xlsx|two visits",
+    "stand": r"sample.?plot|stand.figure|georeferenc(?!e\.json)|/api/plots|runs/compare|[a-z]-plots\b|"
+    r"\bplots-|\"Plots\"|tab Plots|plot-form|report_page|stemmap (stand|report|compare)\b|shapefile|"
+    r"\bdxf\b|xlsx|two visits",
     "learning": r"learning|\blearn-|stemmap train\b|\"train\"|Learn:",
 }
 NAMES = sorted(WORDS)
