@@ -40,7 +40,7 @@ class Extension:
             `run(arguments)`, which returns the exit code.
         takes: Dotted module by the name of a command of the program. The module has `configure(parser)`,
             which adds flags, and `run(arguments)`, which returns the exit code, or None if the command shall
-            do the work.
+            do the work. If it has `check(arguments)`, that is called before any `run` and may refuse them.
         web: Adds routes to the application of a dashboard (`app.state.dashboard`, `app.state.settings`),
             which are tried before those of the program; coroutine functions in the list `app.state.closing`
             are called at its end.

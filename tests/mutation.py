@@ -85,7 +85,7 @@ class Mutant:
 _SLAM = "tests/pipeline/slam"
 _LOOP = "tests/pipeline/loop_closure"
 _LANDMARKS, _GRAPH = "pipeline/slam/particle_maps.py", "pipeline/slam/keyframe_graph.py"
-_MERGED, _AUTH = "pipeline/io/checkpoints/merged_map.py", "app/web/auth.py"
+_MERGED, _AUTH = "app/extensions/maps/merged_map.py", "app/web/auth.py"
 _EVALUATION, _LIMITS_TESTS = (
     "tests/pipeline/evaluation/test_evaluation.py",
     "tests/app/sources/test_limited_process.py",
@@ -100,7 +100,7 @@ _RULE_TESTS, _RAYS_TESTS = (
 _LIMITED = "app/sources/opening.py"
 _UPDATE = f"{_SLAM}/test_fastslam.py -k 'textbook or views or positive'"
 _GRAPH_TESTS = f"{_SLAM}/test_keyframe_graph.py -k 'turns or turned or weight'"
-_MERGED_TESTS = "tests/pipeline/io/test_merged_map.py"
+_MERGED_TESTS = "tests/app/extensions/maps/test_merged_map.py"
 _GUARD = "tests/app/web/test_auth.py -k 'resembles or foreign or names'"
 _TIMES = "tests/pipeline/io/test_clock_steps.py"
 #: Tests that map whole runs; their mutants are in modules without kernels.

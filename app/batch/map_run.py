@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from app.batch.continue_map import (
+from app.batch.run_folder import as_written, read_seen_area, recorded_time, score_map
+from app.batch.saved_run import (
     FORMAT,
-    ContinuedMap,
+    EarlierRun,
     RunStart,
     SavedRun,
     at_origin,
-    continue_map,
 )
-from app.batch.run_folder import as_written, read_seen_area, recorded_time, score_map
 from app.batch.summary import (
     breaks_of,
     driven,
@@ -60,7 +59,7 @@ class OfflineRun:
         seed: Random seed.
         odometry: Source of the motion, see `app.sources.request`.
         truth_trees: True trees that replace those of the source; None for these.
-        continued: The map that is continued; None begins a map.
+        earlier: The run whose map this run goes on with; None begins a map.
         stop_after: Maximum number of scans; None for all.
         revisions: Changes of parameters, ascending: index of the first scan, and all parameters from there
             on.
@@ -74,7 +73,7 @@ class OfflineRun:
     seed: int
     odometry: str
     truth_trees: TruthTrees | None = None
-    continued: ContinuedMap | None = None
+    earlier: EarlierRun | None = None
     stop_after: int | None = None
     revisions: tuple[tuple[int, Parameters], ...] = ()
     on_frame: Callable[[Frame, Mapper], None] | None = None
@@ -100,24 +99,24 @@ class MappingResult:
     stage_ms: dict[str, float] = field(default_factory=dict)
 
 
-def map_run(plan: OfflineRun, folder: FilePath, earlier: FilePath | None = None) -> MappingResult:
+def map_run(plan: OfflineRun, folder: FilePath) -> MappingResult:
     """Map a run, write its files, and return the result for people. The source stays open. Pictures of trees
-    are written at the end, if the source has a camera and no map is continued; their errors are warnings.
+    are written at the end, if the source has a camera and a map was begun; their errors are warnings.
 
     Args:
         plan: The run.
         folder: Folder for the files; those of an earlier run are replaced.
-        earlier: Folder of the run that is continued, or None.
 
     Raises:
         StemmapError: The source cannot be read or has no scan, the odometry is not available, or the start in
-            a continued map was not found, or seen.csv of `earlier` is damaged.
+            an earlier map was not found, or its seen.csv is damaged.
         OSError: The folder cannot be written; it is unchanged then.
     """
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
+    earlier = None if plan.earlier is None else plan.earlier.folder
     with RunFiles(folder, earlier) as files, on_compiling(stopwatch.disturb):
         outcome, mapped = _map(plan, files, stopwatch, earlier)
-    if plan.continued is None:  # the path of an earlier drive has no pictures here
+    if plan.earlier is None:  # the path of an earlier drive has no pictures here
         _keep_pictures(mapped, folder, outcome)
     return outcome
 
@@ -140,7 +139,8 @@ def _map(
     `map_run`.
 
     Args:
-        plan, earlier: As in `map_run`.
+        plan: As in `map_run`.
+        earlier: Folder of the run whose map it goes on with; None for none.
         files: Output files.
         stopwatch: Measures the stages.
     """
@@ -292,27 +292,27 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
 
 def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunStart:
     """Return how the run begins. The warnings of source and odometry are counted in its tally, except if the
-    drive of a continued map is resumed.
+    drive of an earlier map is resumed.
 
     Args:
         plan: The run.
-        mapper: A mapper before its first scan; a continued map is loaded into it.
+        mapper: A mapper before its first scan; an earlier map is loaded into it.
         chosen: Selected source of the motion.
 
     Raises:
-        StemmapError: The start in the continued map was not found, or the source cannot be read.
+        StemmapError: The start in an earlier map was not found, or the source cannot be read.
     """
     warned = (chosen.warning,) if chosen.warning else ()
     warnings = [*warned, *plan.source.description.warnings]
-    if plan.continued is None:
+    if plan.earlier is None:
         return at_origin(plan.source, warnings)
-    return continue_map(plan.continued, plan.source, mapper, chosen.steps, plan.seed, warnings)
+    return plan.earlier.begin(plan.source, mapper, chosen.steps, plan.seed, warnings)
 
 
 def _saved(
     plan: OfflineRun, begun: RunStart, mapper: Mapper, start_ns: int, losses: dict[str, int]
 ) -> SavedRun:
-    """Return the state with which the run can be continued.
+    """Return the state after the last scan.
 
     Args:
         plan: The run.
@@ -336,8 +336,8 @@ def _saved(
 
 def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
     """Return the ground truth in the frame of the map: the trees of the plan, else those of the source, and
-    the path of the source; None in place of unknown trees or an unknown path. For another drive in a
-    continued map, the source is the first one of the map, and the path is None."""
+    the path of the source; None in place of unknown trees or an unknown path. For another drive in an
+    earlier map, the source is the first one of the map, and the path is None."""
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 

@@ -16,7 +16,7 @@ from pipeline.evaluation import MapScores, PathError, Rate
 from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
 
 if TYPE_CHECKING:
-    from app.batch.continue_map import RunSource
+    from app.batch.saved_run import RunSource
 
 
 #: Reason of points of a cloud that are left out.

@@ -20,13 +20,12 @@ from types import ModuleType
 from typing import NoReturn
 
 from app.common.text import version
-from app.extension import all_extensions, extensions_on, problems, switched_off
+from app.extension import Extension, all_extensions, extensions_on, problems, switched_off
 from pipeline.errors import ParameterError, StemmapError, UsageError
 
 COMMANDS = (
     "serve",
     "map",
-    "merge",
     "recover",
     "info",
     "simulate",
@@ -112,6 +111,9 @@ def main(arguments: list[str] | None = None) -> int:
         command = importlib.import_module(commands()[parsed.command])
         with _sigterm_as_ctrl_c():
             for taker in parsed.takers:
+                if hasattr(taker, "check"):
+                    taker.check(parsed)
+            for taker in parsed.takers:
                 if (code := taker.run(parsed)) is not None:
                     return int(code)
             return int(command.run(parsed))
@@ -153,15 +155,24 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
     """
     flags = [flag for action in parser._actions for flag in action.option_strings]
     near = difflib.get_close_matches(unknown[0].split("=")[0], flags, n=1, cutoff=0.6)
-    takers_off = [
+    off = [
         each.name
         for each in all_extensions()
-        if not each.is_on and each.extension is not None and command in each.extension.takes
+        if not each.is_on and each.extension is not None and _adds(each.extension, command, unknown[0])
     ]
-    hint = f"Did you mean {near[0]}? " if near else f"{switched_off(takers_off[0])} " if takers_off else ""
+    hint = f"{switched_off(off[0])} " if off else f"Did you mean {near[0]}? " if near else ""
     raise UsageError(
         f"stemmap {command} does not know {' '.join(unknown)}", remedy=f"{hint}See stemmap {command} --help"
     )
+
+
+def _adds(extension: Extension, command: str, word: str) -> bool:
+    """Return whether an extension adds a flag, the beginning of `word`, to a command of the program."""
+    if command not in extension.takes:
+        return False
+    parser = argparse.ArgumentParser(add_help=False)
+    importlib.import_module(extension.takes[command]).configure(parser)
+    return any(word.split("=")[0] in action.option_strings for action in parser._actions)
 
 
 def _check_command(words: list[str]) -> None:

@@ -395,7 +395,7 @@ def chosen_parameters(
     Args:
         arguments: Parsed, with the flags of `add_parameter_flags`.
         suggested: Preset that suits the source, used where none is named.
-        present: Parameters of a continued map, which replace the suggested preset unless --preset is given;
+        present: Parameters of an earlier run, which replace the suggested preset unless --preset is given;
             None without one.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import signal
 import sys
 import threading
@@ -14,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli import flags
-from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.errors import SourceError
 
 if TYPE_CHECKING:
-    from app.batch.continue_map import Start
+    from app.batch.saved_run import EarlierRun
     from app.robot.source import LiveSource
     from pipeline.io.readers import Source
     from pipeline.mapper import Mapper
@@ -40,20 +39,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--truth", metavar="FILE", type=Path, help="ground truth trees (CSV) for the scores")
     flags.add_dbh_unit_flag(parser)
     parser.add_argument(
-        "--continue",
-        dest="continued",
-        metavar="DIR",
-        type=Path,
-        help="continue the map of an earlier run in this folder; trees keep their numbers",
-    )
-    parser.add_argument(
-        "--start",
-        metavar="WHERE",
-        type=_start,
-        help="start in a continued map: auto (found by the stems, default); X,Y,YAW in m and degrees; "
-        "last (end of the earlier run); resume (the same drive continues)",
-    )
-    parser.add_argument(
         "--as-live",
         action="store_true",
         help="of a recorded live run: map only the scans that were mapped live, for the same map again",
@@ -62,13 +47,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--stop-after",
         metavar="N",
         type=flags.whole_number(1, (1 << 31) - 1),
-        help="map N scans; --start resume maps the rest",
+        help="map only the first N scans",
     )
     parser.set_defaults(seed=None)
     parser.epilog = (
         "Writes trees.csv, path.csv, trees.geojson, detections.csv, terrain.csv, run.json and state.zip\n"
-        "(for --continue) to DIR, with the same bytes for the same source, parameters and seed. A map of\n"
-        "the same source in DIR is replaced. Exit code 3: some messages or points were left out."
+        "(the state of the map) to DIR, with the same bytes for the same source, parameters and seed. A map\n"
+        "of the same source in DIR is replaced. Exit code 3: some messages or points were left out."
     )
 
 
@@ -83,49 +68,39 @@ def run(arguments: argparse.Namespace) -> int:
         StemmapError: The arguments contradict each other, or the run cannot be mapped.
         OSError: The folder --out cannot be written.
     """
-    if arguments.start is not None and arguments.continued is None:
-        raise ParameterError("--start needs a continued map", remedy="Add --continue DIR")
-    flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
-
-    from app.batch.run_folder import partial_output_warnings
-
-    flags.print_warnings(partial_output_warnings(arguments.out))
-    flags.refuse_one_step(arguments)
-    return _run_scans(arguments)
+    return map_scans(arguments)
 
 
-def _run_scans(arguments: argparse.Namespace) -> int:
+def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) -> int:
     """Map a run of scans, recorded, simulated or live; return the exit code.
 
-    With --continue, seed and parameters are those of the saved run unless flags give others. Without flags
-    for parameters, a recorded live run is mapped with the parameters of its recording.
+    With an earlier run, seed and parameters are those of that run unless flags give others. Without flags for
+    parameters, a recorded live run is mapped with the parameters of its recording.
+
+    Args:
+        arguments: Arguments of the command.
+        earlier: The run whose map this run goes on with; None begins a map.
 
     Raises:
         StemmapError: The source cannot be read, a flag is wrong or does not fit the source, the start in the
-            map was not found or, of a live source, is not given, or the folder has the map of another source.
+            map was not found, or the folder has the map of another source.
         OSError: The folder cannot be written.
     """
-    from app.batch.continue_map import ContinuedMap, read_saved_run
+    flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
+
     from app.batch.map_run import OfflineRun, map_run
-    from app.batch.run_folder import check_folder
+    from app.batch.run_folder import check_folder, partial_output_warnings
     from app.robot.source import LiveSource, open_any
-    from app.sources.live_address import is_live
     from app.worker.numba_warmup import compile_ahead
     from app.worker.run import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
     from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
     from pipeline.odometry.lidar_odometry import LOST
 
+    flags.print_warnings(partial_output_warnings(arguments.out))
+    flags.refuse_one_step(arguments)
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
-    saved = read_saved_run(arguments.continued) if arguments.continued else None
-    start: Start = arguments.start or "auto"
-    if saved and start == "auto" and is_live(arguments.source):
-        raise StemmapError(
-            "a robot that is driving cannot be located in a saved map by its stems",
-            where=arguments.source,
-            remedy="Give its pose with --start X,Y,YAW (m, m, degrees) or --start last, or record the drive "
-            "and continue the map with the file",
-        )
+    saved = None if earlier is None else earlier.saved
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
     request = flags.source_request(arguments, arguments.source)
@@ -166,13 +141,13 @@ def _run_scans(arguments: argparse.Namespace) -> int:
                 seed=arguments.seed,
                 odometry=arguments.odometry,
                 truth_trees=truth_trees,
-                continued=ContinuedMap(saved, start) if saved else None,
+                earlier=earlier,
                 stop_after=arguments.stop_after,
                 revisions=revisions,
                 on_frame=mapped,
                 chosen=chosen,
             )
-            outcome = map_run(plan, arguments.out, arguments.continued)
+            outcome = map_run(plan, arguments.out)
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
     return tell(
@@ -212,21 +187,6 @@ def tell(
     for reason, number in losses.items():
         print(f"left out: {reason} ({number:,})", file=sys.stderr)
     return 3 if losses or any(text.startswith(wrong) for text in warnings) else 0
-
-
-def _start(text: str) -> Start:
-    """Parse --start: auto, last, resume, or x, y [m], yaw [deg], which is returned as a pose; raises
-    argparse.ArgumentTypeError for other texts and for numbers beyond 1e6."""
-    named: dict[str, Start] = {"auto": "auto", "last": "last", "resume": "resume"}
-    if text in named:
-        return named[text]
-    try:
-        x, y, yaw = flags.numbers("X,Y,YAW", 1e6)(text)
-    except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or X,Y,YAW") from None
-    from pipeline.geometry.poses import Pose2
-
-    return Pose2(x, y, math.radians(yaw))
 
 
 # --- live sources ------------------------------------------------------------------------------------

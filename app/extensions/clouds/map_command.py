@@ -33,10 +33,8 @@ def run(arguments: argparse.Namespace) -> int | None:
     request = flags.source_request(arguments, arguments.source)
     if not is_cloud(arguments.source, request.options()):
         return None
-    if arguments.continued is not None or arguments.start is not None or arguments.stop_after is not None:
-        raise ParameterError(
-            "a whole cloud has no scans", remedy="Remove --continue, --start and --stop-after"
-        )
+    if arguments.stop_after is not None:
+        raise ParameterError("a whole cloud has no scans", remedy="Remove --stop-after")
     from app.batch.run_folder import check_folder, partial_output_warnings
     from app.cli.map import tell
     from app.extensions.clouds.inventory import SECTION

@@ -317,7 +317,7 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
             that of a live run), or they are not in the area of the reference system or do
             not fit the path.
     """
-    from app.batch.continue_map import read_saved_run
+    from app.batch.saved_run import read_saved_run
     from app.sources.live_address import is_live
     from app.sources.opening import open_source
     from pipeline.io.readers.measured_poses import fit_rigid

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.batch.continue_map import RunSource
+from app.batch.saved_run import RunSource
 from app.batch.summary import breaks_of, driven
 from pipeline.types.records import Path
 

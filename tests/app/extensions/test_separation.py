@@ -27,6 +27,7 @@ WORDS = {
     "dds": r"\bdds:|DdsLink|cyclone|plain DDS|fast_?dds",
     "fleet": r"fleet|robots-link|common.map",
     "formats": r"victoria",
+    "maps": r"--continue|ContinuedMap|continue_map|merge_runs|stemmap merge|merged_map|\blocalise|\"merge\"",
     "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
     # georeference.json has the reference system of a map, which the core reads for its files.
     "stand": r"sample.?plot|stand.figure|georeferenc(?!e\.json)|/api/plots|runs/compare|[a-z]-plots\b|"
@@ -68,6 +69,8 @@ def test_only_its_own_files_name_an_extension(name):
         ("tune sim:stand", "search"),
         ("train", "learning"),
         ("report DIR", "stand"),
+        ("merge a b --out c", "maps"),
+        ("map sim:stand --out a --continue b", "maps"),
         ("evaluate sim:stand --param-grid x=1", "search"),
     ],
 )

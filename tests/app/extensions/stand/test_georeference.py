@@ -212,7 +212,7 @@ def test_fixes_of_the_recording_place_the_map_in_spite_of_outliers(run, capsys, 
     monkeypatch.setattr(RosSource, "close", lambda _source: None)
     monkeypatch.setattr("app.sources.opening.open_source", lambda _uri: source)
     saved = SimpleNamespace(start_ns=start_ns)
-    monkeypatch.setattr("app.batch.continue_map.read_saved_run", lambda _folder: saved)
+    monkeypatch.setattr("app.batch.saved_run.read_saved_run", lambda _folder: saved)
     result = stemmap(capsys, "georeference", run, "--gnss", "--crs", "EPSG:25832")
     assert result.code == 0, result.err
     used = re.search(r"by (\d+) of 41 GNSS fixes", result.out)

@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from app.batch.continue_map import PAUSE_NS, SavedRun, read_saved_run
 from app.batch.run_folder import check_folder, read_run_record, read_seen_area
+from app.batch.saved_run import SavedRun, read_saved_run
 from app.batch.summary import RunHealth, RunTotals, breaks_of, driven
 from app.common.text import changed_values, version
+from app.extensions.maps.continue_map import PAUSE_NS
+from app.extensions.maps.merged_map import MergedMap, merge_maps
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
-from pipeline.io.checkpoints.merged_map import MergedMap, merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.result_files import DETECTION_COLUMNS, RunFiles, csv_text, seen_text, terrain_text
 from pipeline.loop_closure.stem_matching import MapStems, Match, find_constellation

@@ -160,3 +160,18 @@ def test_a_damaged_state_is_refused(tmp_path, capsys):
         (tmp_path / "state.zip").write_bytes(broken)
         assert main(["map", PLAIN, "--continue", str(tmp_path), "--out", str(tmp_path / "b")]) == 1
         assert "damaged" in capsys.readouterr().err
+
+
+def test_a_map_without_a_drive_cannot_be_continued_or_merged(tmp_path, capsys):
+    source = {"uri": "plot.laz", "offset_m": [0.0, 0.0, 0.0]}
+    (tmp_path / "run.json").write_text(json.dumps({"source": source, "parameters": {}}))
+    folder, out = str(tmp_path), str(tmp_path / "out")
+    for words in (["map", PLAIN, "--continue", folder], ["merge", folder, folder]):
+        assert main([*words, "--out", out]) == 1
+        assert "no map of a drive and cannot be continued" in capsys.readouterr().err
+
+
+def test_a_source_without_scans_continues_no_map(stand, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("app.sources.one_step.is_one_step", lambda _uri, _options: True)
+    assert main(["map", PLAIN, "--continue", str(stand), "--out", str(tmp_path / "out")]) == 2
+    assert "no scans" in capsys.readouterr().err

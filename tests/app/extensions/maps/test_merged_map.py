@@ -6,9 +6,9 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from app.extensions.maps.merged_map import merge_maps
 from pipeline.geometry.pose_arrays import composed
 from pipeline.geometry.poses import Pose2
-from pipeline.io.checkpoints.merged_map import merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Columns

@@ -37,9 +37,9 @@ def run(arguments: argparse.Namespace) -> int:
     """
     import numpy as np
 
-    from app.batch.continue_map import read_saved_run
-    from app.batch.merge import merge_runs
+    from app.batch.saved_run import read_saved_run
     from app.common.text import count
+    from app.extensions.maps.merge import merge_runs
     from pipeline.config import assign
 
     parameters = None
