@@ -194,15 +194,15 @@ def at_origin(source: Source, warnings: list[str]) -> RunStart:
 
 
 class EarlierRun(Protocol):
-    """A run whose map another run goes on with.
+    """A run whose map another run goes on with."""
 
-    Attributes:
-        folder: Folder of its files.
-        saved: Its state.
-    """
+    @property
+    def folder(self) -> Path:
+        """Folder of its files."""
 
-    folder: Path
-    saved: SavedRun
+    @property
+    def saved(self) -> SavedRun:
+        """Its state."""
 
     def begin(
         self, source: Source, mapper: Mapper, odometry: OdometryChoice, seed: int, warnings: list[str]
