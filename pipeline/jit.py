@@ -1,9 +1,9 @@
 """Compilation of kernels by Numba, and the cache of their machine code.
 
 A kernel is compiled at its first call and cached next to its source, so that only the first start on a
-machine compiles. All machines compile for one target (`fix_target`), so that the machine code can be copied
-to another machine, and the same input gives the same bytes there. `fastmath` is off for the same reason; only
-`compiled_sums` may change the order of the terms of a sum.
+machine compiles. All machines of a kind compile for one target (`fix_target`), so that kernels can be copied
+to another machine and compute the same there. `fastmath` is off for the same reason; only `compiled_sums` may
+change the order of the terms of a sum.
 
 A kernel includes functions and constants of other modules. Numba checks only the time of the file of a
 kernel; here the cache is valid for a digest of all modules of this project that the file imports.
@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, ParamSpec, TypeVar
 
 import llvmlite.binding
@@ -32,11 +33,10 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 #: Name of the target of compilation in LLVM, and the features of a processor that has it (System V ABI for
-#: x86-64, level 3: Intel since 2013, AMD since 2015), by the name of the machine.
-_TARGETS = {
-    "x86_64": ("x86-64-v3", ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave")),
-    "aarch64": ("generic", ()),
-}
+#: x86-64, level 3: Intel Core and Xeon since 2013, AMD since 2015), by the name of the machine.
+_X86_64_V3 = ("x86-64-v3", ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"))
+_ARMV8: tuple[str, tuple[str, ...]] = ("generic", ())
+_TARGETS = {"x86_64": _X86_64_V3, "AMD64": _X86_64_V3, "aarch64": _ARMV8, "arm64": _ARMV8}
 
 _FROM = re.compile(r"^from ([\w.]+) import (\([^)]*\)|.*)$", re.MULTILINE)
 _IMPORT = re.compile(r"^import (.*)$", re.MULTILINE)
@@ -180,14 +180,17 @@ def _copy_delivered(delivered: Path, file: Any, base: str) -> None:  # noqa: ANN
         base: Beginning of the names of the files with machine code of the present sources.
     """
     index = Path(file._index_path)
-    if index.parent == delivered or index.exists() or not (delivered / index.name).exists():
+    codes = tuple(delivered.glob(f"{glob.escape(base)}.*.nbc"))
+    if index.parent == delivered or not codes or file._load_index():
         return
     with suppress(OSError):  # else the kernel is compiled
         index.parent.mkdir(parents=True, exist_ok=True)
-        for each in (*delivered.glob(f"{glob.escape(base)}.*.nbc"), delivered / index.name):  # the index last
-            part = index.parent / f"{each.name}.{uuid.uuid4().hex}"
-            shutil.copyfile(each, part)
-            part.replace(index.parent / each.name)
+        with locked(index), TemporaryDirectory(dir=index.parent) as parts:
+            if file._load_index():
+                return
+            for each in (*codes, delivered / index.name):  # the index last
+                part = shutil.copyfile(each, Path(parts) / each.name)
+                part.replace(index.parent / each.name)
 
 
 def _saved_by_one(file: Any, base: str) -> Callable[[Any, Any], None]:  # noqa: ANN401

@@ -23,4 +23,6 @@ class KernelsInWheel(BuildHookInterface):  # type: ignore[misc]
         root = Path(self.root)
         for package in ("app", "pipeline"):
             for file in sorted((root / package).glob("**/__pycache__/*.nb[ci]")):
-                build_data["force_include"][str(file)] = file.relative_to(root).as_posix()
+                source = file.parent.parent / f"{file.name.partition('.')[0]}.py"
+                if source.exists():  # else a kernel of an earlier version
+                    build_data["force_include"][str(file)] = file.relative_to(root).as_posix()

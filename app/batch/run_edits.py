@@ -68,7 +68,7 @@ def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content] | N
         store: The store.
         source: Member `source` of run.json.
     """
-    if not store.was_annotated(key := recording_key(source)):
+    if not store.was_reviewed(key := recording_key(source)):
         return None
     return [content for content in store.contents(key) if content.kind in (*KINDS, SKIPPED)]
 

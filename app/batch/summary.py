@@ -166,10 +166,12 @@ def health_word(frame: Frame | None, distance_m: float = math.inf) -> str:
     """
     if frame is None:
         return "no scan yet"
-    if frame.health.state != "good":
-        return frame.health.state
+    if frame.estimate.health.state != "good":
+        return frame.estimate.health.state
     if not frame.trees.confirmed.any():
         return "no trees yet"
+    if frame.health.state != "good":
+        return frame.health.state
     if frame.index < JUST_BEGUN:
         return "just begun"
     return "static" if distance_m < STILL_M else "good"

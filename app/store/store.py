@@ -45,6 +45,7 @@ from app.store.records import (
     KINDS,
     MOST_ANNOTATIONS,
     MOST_SETS,
+    SKIPPED,
     Annotation,
     Author,
     Change,
@@ -453,17 +454,20 @@ class Store:
         with self._engine.begin() as connection:
             return [_content(row) for row in connection.execute(query.order_by(_annotations.c.id))]
 
-    def was_annotated(self, source: str) -> bool:
-        """Return whether a source ever had an annotation, also one that is deleted now.
+    def was_reviewed(self, source: str) -> bool:
+        """Return whether a tree of a source was ever reviewed: whether it has an annotation of KINDS or
+        SKIPPED, also one that is deleted now.
 
         Args:
             source: Digest of the recording, or its URI if it has no digest.
         """
-        query = select(_annotations.c.id).join(_runs, _runs.c.id == _annotations.c.run)
+        query = (
+            select(_annotations.c.id)
+            .join(_runs, _runs.c.id == _annotations.c.run)
+            .where(_runs.c.source == _key(source), _annotations.c.kind.in_((*KINDS, SKIPPED)))
+        )
         with self._engine.begin() as connection:
-            return (
-                connection.execute(query.where(_runs.c.source == _key(source)).limit(1)).first() is not None
-            )
+            return connection.execute(query.limit(1)).scalar() is not None
 
     def annotation_counts(self) -> dict[int, int]:
         """Return a dict from the number of each source with annotations of KINDS to their number."""

@@ -52,9 +52,9 @@ def is_compiled() -> bool:
     """Return whether the kernels of both programs are cached for the current sources, by the kernel that each
     program compiles last."""
     from pipeline.jit import is_kept
-    from pipeline.tracking.track_classification import classify, nearest_other
+    from pipeline.tracking.track_classification import classify_new, nearest_other
 
-    return is_kept(nearest_other) and is_kept(classify)
+    return is_kept(nearest_other) and is_kept(classify_new)
 
 
 def compiled_share() -> float:
@@ -188,4 +188,6 @@ if __name__ == "__main__":
     _programs = {"warm_up": warm_up, "map_scene": map_scene, "warm_tree_map": warm_tree_map}
     if sys.argv[1:]:
         run_child(lambda _: _programs[sys.argv[1]]())
-    warm_up()
+    compile_ahead()
+    warm_tree_map()
+    map_scene()

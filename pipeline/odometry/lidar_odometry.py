@@ -259,16 +259,18 @@ class LidarOdometry:
             span_s = (middle_ns - before_ns) * 1e-9
             largest = np.array([FASTEST, FASTEST, FASTEST_TURN]) * span_s
             of_scan, disagreement = self._covariance(upright, above, largest)
-            T = fused(T, above, of_scan)
+            T, difference = fused(T, above, of_scan)
             self._disagreement += (disagreement - self._disagreement) * min(span_s * 1e9 / LOST_NS, 1.0)
             of_scan *= max(self._disagreement / 3.0, 1.0)
-            if (np.diag(of_scan) < SHOWN).all():
-                self._shown_ns = middle_ns
+            if difference is not None:  # the covariance is that of the pose that is not used
+                of_scan = WHOLE + np.outer(difference, difference)
             step = np.linalg.inv(self._T_odom_base) @ T
             is_determined = bool((np.diag(of_scan) < DETERMINED * largest**2).all())
             if shared >= SHARED and is_determined and _is_possible(step, middle_ns - before_ns):
                 covariance = step_covariance(of_scan, step, largest)
                 self._registered_ns = middle_ns
+                if difference is None and (np.diag(of_scan) < SHOWN).all():
+                    self._shown_ns = middle_ns
             else:
                 count_loss(self.losses, "scans that LiDAR odometry could not place")
                 failing_s = (middle_ns - self._registered_ns) * 1e-9
@@ -474,20 +476,26 @@ def _planar_of(T: Float, planar: Float) -> Float:
     return combined
 
 
-def fused(whole: Float, above: Float, covariance: Float) -> Float:
-    """Return the mean of two poses that differ in x, y and yaw, weighted by their inverse covariances: WHOLE
-    of the whole cloud, and that of the points above the ground, shape (3, 3); the first pose if they
-    contradict each other (CONTRADICTED). Poses have the shape (4, 4)."""
+def fused(whole: Float, above: Float, covariance: Float) -> tuple[Float, Float | None]:
+    """Return the mean of two poses that differ in x, y and yaw, weighted by their inverse covariances, and
+    None; if they contradict each other (CONTRADICTED), the first pose and their difference x, y [m], yaw
+    [rad] in its frame, shape (3,).
+
+    Args:
+        whole: Pose by the whole cloud, with the covariance WHOLE, shape (4, 4).
+        above: Pose by the points above the ground, shape (4, 4).
+        covariance: Its covariance, shape (3, 3), of x, y [m], yaw [rad] in the frame of `whole`.
+    """
     apart = np.linalg.inv(whole) @ above
     d = np.array([apart[0, 3], apart[1, 3], np.arctan2(apart[1, 0], apart[0, 0])])
     weighted = np.linalg.solve(WHOLE + covariance, d)
     if float(d @ weighted) > CONTRADICTED:
-        return whole
+        return whole, d
     x, y, yaw = (WHOLE @ weighted).tolist()
     share = Pose3.from_euler(np.array([x, y, 0.0]), 0.0, 0.0, yaw)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = share.R, share.t
-    return _planar_of(whole, whole @ T)
+    return _planar_of(whole, whole @ T), None
 
 
 def scaled(step: Float, share: float) -> Float:

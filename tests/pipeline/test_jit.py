@@ -204,6 +204,8 @@ def test_kernels_that_were_delivered_beside_their_sources_are_used_from_another_
     assert call(folder, 2.0, 1.0, in_tree=True) == ["4.0", *COMPILED]
     assert call(folder, 2.0, 1.0) == ["4.0", *LOADED]
     assert call(folder, 5.0, 1.0) == ["10.0", *COMPILED]  # the delivered ones are of other sources
+    assert call(folder, 3.0, 1.0, in_tree=True) == ["6.0", *COMPILED]  # another version is delivered
+    assert call(folder, 3.0, 1.0) == ["6.0", *LOADED]
 
 
 TARGET = """
@@ -259,6 +261,8 @@ def test_a_wheel_takes_the_kernels_along_and_an_editable_one_does_not(tmp_path, 
     kernel.parent.mkdir(parents=True)
     kernel.touch()
     (kernel.parent / "a.cpython-311.pyc").touch()
+    (kernel.parent.parent / "a.py").touch()
+    (kernel.parent / "gone.f-1.py311.nbi").touch()
     for version, files in (
         ("standard", {str(kernel): "pipeline/slam/__pycache__/a.f-1.py311.nbi"}),
         ("editable", {}),

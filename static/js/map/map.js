@@ -21,7 +21,7 @@ const LEGEND_EVERY = 500; // [ms] between two updates
 const POINT_REACH = 9; // [px] around clusters and ground truth
 const canvas = byId("map");
 // Whether a tool of an extension takes an event.
-const byTool = (name, ...args) => ofExtensions("mapTools").some((tool) => tool[name](...args));
+const byTool = (name, ...args) => ofExtensions("mapTools").some((tool) => tool[name]?.(...args));
 
 const map = new MapCanvas(canvas, {
   top: BUTTONS_HEIGHT,

@@ -5,8 +5,9 @@ import { byId, el, setText } from "../core/dom.js";
 import { clock, count } from "../core/format.js";
 import { startPopover } from "../core/popover.js";
 import { attempted } from "../core/problem.js";
-import { on, state } from "../core/store.js";
+import { isDrive, on, state } from "../core/store.js";
 import { newestFirst } from "../core/timing.js";
+import { timeLink } from "./time_link.js";
 
 const ICONS = { play: "M5 3l12 7-12 7z", pause: "M5 3h4v14H5zM12 3h4v14h-4z" };
 let dragging = false;
@@ -96,17 +97,18 @@ function showWarnings(warnings) {
   const groups = grouped(warnings), list = byId("warnings"), shown = JSON.stringify(groups);
   if (list.dataset.shown === shown) return;
   list.dataset.shown = shown;
-  list.replaceChildren(...groups.map(({ text, number, at }) => el("li", { text }, number > 1 ? ` (${number} times)` : "",
-    at === undefined ? "" : el("button", { class: "quiet small", type: "button", text: clock(at), title: "Show the scan of this warning", onclick: () => seek(at) }))));
+  const canSeek = isDrive() && !state.status.live;
+  list.replaceChildren(...groups.map(({ texts, at }) => el("li", { title: texts.length > 1 ? texts.join("\n") : "" }, texts.at(-1),
+    texts.length > 1 ? ` (${texts.length} times)` : "", at === undefined || !canSeek ? "" : " ", at === undefined || !canSeek ? "" : timeLink(at))));
 }
 
-// Warnings that differ in numbers only are one, with the newest text, how many there are, and the time of the last.
+// Warnings that differ in numbers only are one, with all texts, and the time at which the newest text was given first.
 function grouped(warnings) {
   const groups = new Map();
   for (const text of warnings) {
-    const key = text.replace(/\d+/g, "0");
+    const key = text.replace(/(?<![\w/.])\d+(\.\d+)?(?![\w/])/g, "0"); // not the number in a name, as /lidar1
     const at = state.events.findLast(({ kind, text: of }) => kind === "warning" && text.startsWith(of))?.t;
-    groups.set(key, { text, number: (groups.get(key)?.number ?? 0) + 1, at });
+    groups.set(key, { texts: [...(groups.get(key)?.texts ?? []), text], at });
   }
   return [...groups.values()];
 }

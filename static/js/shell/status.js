@@ -59,13 +59,13 @@ const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first
 // A state that is worse than that of the newest scan stays for a moment while the run plays, so that a doubt about a few
 // scans can be read.
 const HELD_FOR = 2000; // [ms]
-let held = { state: "good", reason: "", at: -Infinity };
+let held = { state: "good", reason: "", source: "", at: -Infinity };
 
-function health({ health: word, state: phase }) {
+function health({ health: word, state: phase, source }) {
   const known = state.map?.health;
-  const now = { state: word, reason: known?.state === word ? known.reason : "", at: performance.now() };
-  const isWorse = TESTED.indexOf(held.state) > TESTED.indexOf(word);
-  if (phase !== "playing" || !isWorse || now.at - held.at > HELD_FOR) held = now;
+  const now = { state: word, reason: known?.state === word ? known.reason : "", source, at: performance.now() };
+  const isWorse = TESTED.includes(word) && TESTED.indexOf(held.state) > TESTED.indexOf(word);
+  if (phase !== "playing" || held.source !== source || !isWorse || now.at - held.at > HELD_FOR) held = now;
   return [held.state, { good: "good", weak: "warn", lost: "bad" }[held.state] ?? "soon", SOON[held.state] || held.reason || "SLAM health"];
 }
 

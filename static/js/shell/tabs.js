@@ -20,7 +20,9 @@ export function openTab(name) {
   changed("tab");
 }
 
-function addTab({ name, title, before }) {
+// In front of a tab of an extension that is switched off, a tab comes last.
+function addTab({ name, title, before: wanted }) {
+  const before = NAMES.includes(wanted) ? wanted : NAMES.at(-1);
   byId(`tab-${before}`).before(el("button", { role: "tab", id: `tab-${name}`, "aria-controls": `panel-${name}`, "aria-selected": "false", tabindex: "-1", text: title }));
   byId(`panel-${before}`).before(el("section", { id: `panel-${name}`, class: "panel", role: "tabpanel", "aria-labelledby": `tab-${name}`, hidden: true }));
   NAMES.splice(NAMES.indexOf(before), 0, name);

@@ -1,6 +1,7 @@
 // The row of a parameter: slider, text box, and reset to the preset.
 
 import { el, setText } from "../core/dom.js";
+import { changed } from "../core/store.js";
 import { isChanged, isMoving, newGesture, redo, reset, setValue, shown, tuning, undo, valueOf } from "./parameters.js";
 import { beginDrag, FINE, fromPlace, pressed, toPlace } from "./slider.js";
 
@@ -13,14 +14,21 @@ export function rowOf(spec, ...further) {
   const label = el("label", { for: id, title: `${spec.doc} (${spec.name})` }, el("i", { class: "mark-changed", "aria-hidden": "true", text: "●" }), spec.title,
     spec.unit ? el("small", { text: ` ${spec.unit}` }) : "");
   const [inputs, fill] = spec.kind === "bool" ? box(spec, id) : spec.kind === "choice" ? list(spec, id) : spec.kind === "name" ? word(spec, id) : number(spec, id);
+  const refused = el("p", { id: `${id}-refused`, class: "error", role: "alert", hidden: true });
   const node = el("div", { class: "tune-row", "data-parameter": spec.name, "data-words": `${spec.name} ${spec.title} ${spec.doc} ${spec.stage}`.toLowerCase() },
-    el("span", { class: "tune-name" }, label, ...further), ...inputs.slice(0, 2), back, ...inputs.slice(2));
+    el("span", { class: "tune-name" }, label, ...further), ...inputs, back, refused);
+  let known = null;
   const show = (wanted) => {
     const different = isChanged(spec.name);
     node.classList.toggle("changed", different);
     back.hidden = !different;
     back.title = `Back to ${shown(wanted, spec)}, the value of the preset`;
-    if (!isMoving(spec.name)) fill(valueOf(spec.name));
+    if (isMoving(spec.name)) return;
+    if (valueOf(spec.name) !== known) tuning.refused[spec.name] = ""; // another value came after the refused one
+    known = valueOf(spec.name);
+    setText(refused, tuning.refused[spec.name]);
+    refused.hidden = !tuning.refused[spec.name];
+    fill(known);
   };
   return { node, show };
 }
@@ -44,22 +52,18 @@ function word(spec, id) {
 function number(spec, id) {
   const typed = el("input", { id, type: "text", inputmode: "decimal", autocomplete: "off", spellcheck: "false" });
   const slider = el("input", { type: "range", min: "0", max: String(FINE), step: "1", "aria-label": `${spec.title}, slider` });
-  const refused = el("p", { id: `${id}-refused`, class: "error", role: "alert", hidden: true });
-  typed.setAttribute("aria-describedby", refused.id);
+  typed.setAttribute("aria-describedby", `${id}-refused`);
   let known = "";
   const refuse = (reason) => {
     tuning.refused[spec.name] = reason;
-    fill(valueOf(spec.name));
+    changed("tuning");
   };
   const fill = (value) => {
-    if (String(value) !== known) tuning.refused[spec.name] = ""; // another value came after the refused one
     known = String(value);
-    const reason = tuning.refused[spec.name];
-    setText(refused, reason);
-    refused.hidden = !reason;
-    typed.setAttribute("aria-invalid", String(Boolean(reason)));
+    const isRefused = Boolean(tuning.refused[spec.name]);
+    typed.setAttribute("aria-invalid", String(isRefused));
     const isTyping = document.activeElement === typed && typed.classList.contains("dirty");
-    if (!isTyping && !reason) typed.value = known; // what was typed and refused remains
+    if (!isTyping && !isRefused) typed.value = known; // what was typed and refused remains
     slider.value = String(toPlace(spec, value));
     slider.setAttribute("aria-valuetext", shown(value, spec));
   };
@@ -79,7 +83,7 @@ function number(spec, id) {
   });
   slider.addEventListener("input", () => send(fromPlace(spec, Number(slider.value)))); // of assistive technology
   slider.addEventListener("keydown", (event) => {
-    const value = pressed(spec, Number(typed.value), event);
+    const value = pressed(spec, Number(tuning.refused[spec.name] ? known : typed.value), event);
     if (value === null) return;
     event.preventDefault(); // by the step of the parameter, not of the slider
     send(value);
@@ -106,5 +110,5 @@ function number(spec, id) {
       else undo();
     }
   });
-  return [[slider, typed, refused], fill];
+  return [[slider, typed], fill];
 }

@@ -326,10 +326,13 @@ def test_registrations_of_a_scan_are_weighted_and_the_whole_cloud_is_kept_where_
     above = whole.copy()
     turn = Pose3.from_euler(np.zeros(3), 0.0, 0.0, yaw)
     above[:3, :3], above[:2, 3] = turn.R @ whole[:3, :3], whole[:2, 3] + (x, y)
-    found = fused(whole, above, scale * WHOLE)
+    found, difference = fused(whole, above, scale * WHOLE)
     d = np.linalg.inv(whole) @ above
     apart = np.array([d[0, 3], d[1, 3], np.arctan2(d[1, 0], d[0, 0])])
     contradicted = apart @ np.linalg.solve((1.0 + scale) * WHOLE, apart) > CONTRADICTED
+    assert (difference is not None) == contradicted
+    if difference is not None:  # then it is not known which of the two is right
+        np.testing.assert_allclose(difference, apart)
     share = 0.0 if contradicted else 1.0 / (1.0 + scale)
     np.testing.assert_allclose(found[:2, 3], whole[:2, 3] + share * np.array([x, y]), atol=0.03)
     np.testing.assert_allclose(found[2], whole[2], atol=1e-9)  # height and tilt are those of the whole cloud

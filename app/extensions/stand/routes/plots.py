@@ -28,7 +28,7 @@ from app.extensions.stand.plots import centres_along, plot_of
 from app.extensions.stand.questions import PLOTS_OF_FILE
 from app.extensions.stand.routes.figure_parameters import FigureParameters
 from app.sources import opening
-from app.store.records import Content, UnknownError
+from app.store.records import Annotation, Content, UnknownError
 from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, as_bad_request, json_reply
 from app.web.routes.access import (
@@ -182,7 +182,7 @@ async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response
     """Rename a plot, or change the radius of a circle; return its number (`id`) and the counts of edits, see
     `edited`. 404 for an unknown plot, 409 if it does not have this version any more or another run was
     opened, 422 for a name that is empty or taken, or the radius of another shape."""
-    row = next((row for row in dashboard.annotation_editor.others if row.id == number), None)
+    row = next((row for row in _rows(dashboard) if row.id == number), None)
     if row is None or row.content.values is None:
         raise UnknownError("there is no such plot", where=f"plot {number}")
     plot = dict(row.content.values)
@@ -209,7 +209,7 @@ async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, di
         with as_bad_request():
             middle = plot_of(name, shape).shape.centroid
         contents.append(Content(middle.x, middle.y, PLOT, None, {"name": name, "shape": shape}))
-    rows = dashboard.annotation_editor.others
+    rows = _rows(dashboard)
     corners = sum(_corners(c.values or {}) for c in (*(row.content for row in rows), *contents))
     if len(rows) + len(contents) > MOST_PLOTS or corners > _MOST_CORNERS:
         raise BadRequestError(
@@ -222,7 +222,12 @@ async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, di
 
 def _names(dashboard: Dashboard) -> set[str]:
     """Return the names of the plots of the open run."""
-    return {row.content.values["name"] for row in dashboard.annotation_editor.others if row.content.values}
+    return {row.content.values["name"] for row in _rows(dashboard) if row.content.values}
+
+
+def _rows(dashboard: Dashboard) -> list[Annotation]:
+    """Return the annotations that are plots of the open run; other extensions have other classes."""
+    return [row for row in dashboard.annotation_editor.others if row.content.kind == PLOT]
 
 
 def _checked_name(name: str, taken: set[str]) -> str:
