@@ -126,18 +126,20 @@ def is_one_step(uri: str, options: SourceOptions | None = None) -> bool:
 
 def _module_of(uri: str, options: SourceOptions | None) -> ModuleType | None:
     """Return the module of the extension that maps a source in one step; None if none does. Raises
-    SourceError if the extension is switched off. One that fails is logged and left out."""
-    for name, each in ((each.name, each) for each in all_extensions()):
+    SourceError if only an extension that is switched off does. One that is on and fails is logged and left
+    out."""
+    for each in sorted(all_extensions(), key=lambda each: not each.is_on):  # those that are on first
         if each.extension is None or not each.extension.sources:
             continue
         try:
             module = import_module(each.extension.sources)
             takes = module.takes(uri, options)
         except Exception:  # the code of others: other sources can be opened without it
-            _log.exception("the sources of the extension %s are left out", name)
+            if each.is_on:
+                _log.exception("the sources of the extension %s are left out", each.name)
             continue
         if takes and not each.is_on:
-            raise SourceError(f"{module.WHAT} needs an extension", where=uri, remedy=switched_off(name))
+            raise SourceError(f"{module.WHAT} needs an extension", where=uri, remedy=switched_off(each.name))
         if takes:
             return module
     return None

@@ -54,7 +54,7 @@ NEIGHBOURS = 10
 LINE = 0.1
 #: Covariance x, y [m^2], yaw [rad^2] of the registration of the whole cloud. Where the points above ground
 #: determine the pose well, its difference from theirs has an RMS of 2 cm and 1 to 3 mrad in simulated drives;
-#: the pull of the rings is the same in successive scans, which no mean reduces.
+#: twice that, because the pull of the rings is the same in successive scans, which no mean reduces.
 WHOLE = np.diag([0.05, 0.05, 0.005]) ** 2
 #: Largest distance between a point and the mean of its voxel [m], and maximum number of iterations.
 CORRESPONDENCE, ITERATIONS = 1.0, 30
