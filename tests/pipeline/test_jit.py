@@ -271,3 +271,19 @@ def test_a_wheel_takes_the_kernels_along_and_an_editable_one_does_not(tmp_path, 
         hook.initialize(version, build)
         assert build["force_include"] == files
     monkeypatch.delitem(sys.modules, "pipeline.wheel_kernels")
+
+
+def test_kernels_are_compiled_for_that_target(tmp_path):
+    program = (
+        "import numba, pipeline.jit\nfrom numba.core.registry import cpu_target\n"
+        "print(numba.config.CPU_NAME in (None, cpu_target.target_context.codegen().magic_tuple()[1]))"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment(tmp_path),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert told.stdout.strip() == "True"
