@@ -158,7 +158,8 @@ def warm_tree_map() -> None:
     from pipeline.tracking.track_classification import tree_columns
     from pipeline.types.records import Sensor
 
-    stems, clusters = preset("stems"), ClusterTable()
+    # All scans resample, which usual ones do late in a run.
+    stems, clusters = preset("stems").replace({"slam.resample_below": 1.0}), ClusterTable()
     mapper = Mapper(stems, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
     for step in _stems():
         clusters.record(mapper.process(step))
@@ -171,16 +172,17 @@ def warm_tree_map() -> None:
 
 def _stems() -> Iterator[Step]:
     """Yield twelve steps, 0.1 s apart, of a robot that drives 0.5 m per scan along x, between trees in a grid
-    with spacings of 3 m in x and 2.5 to 3 m in y."""
+    with spacings of 3 m in x and 2.5 to 3 m in y; then one without trees, so far away that the trees are
+    those of another place, and two between the trees again."""
     from pipeline.geometry.poses import Pose2
     from pipeline.types.records import Scan, Stems, Step
 
     x, y = np.meshgrid(np.arange(-6.0, 12.0, 3.0), np.array([-4.0, -1.5, 1.5, 4.0]))
-    for index in range(12):
-        along = 0.5 * index
+    for index, along in enumerate([*np.arange(0.0, 6.0, 0.5), 50.0, 0.0, 0.5]):
         places = np.column_stack([x.ravel() - along, y.ravel(), np.zeros(x.size)]).astype(np.float32)
-        upright = np.tile([0.0, 0.0, 1.0], (x.size, 1))
-        scan = Scan(100_000_000 * index, places, stems=Stems(upright, np.full(x.size, 0.3)))
+        places = places[: 0 if along > 6.0 else x.size]
+        upright = np.tile([0.0, 0.0, 1.0], (len(places), 1))
+        scan = Scan(100_000_000 * index, places, stems=Stems(upright, np.full(len(places), 0.3)))
         yield Step(index, scan, Pose2(along, 0.0, 0.0))
 
 

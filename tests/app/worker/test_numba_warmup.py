@@ -22,6 +22,11 @@ from app.worker.numba_warmup import compiled_share, is_compiled, map_scene, warm
 from app.worker.process import new_session
 from app.worker.protocol import Open
 from pipeline.config import Parameters
+from pipeline.slam.particle_ancestry import best_after_resampling
+from pipeline.slam.particle_maps import take_ancestors
+from pipeline.slam.places import agreement
+from pipeline.tracking.track_classification import classify_new
+
 
 def seen():
     return {
@@ -35,13 +40,16 @@ map_scene()
 warm_tree_map()
 assert is_compiled()
 assert compiled_share() > 0.95, compiled_share()
+# What a run calls later: at a resampling, at a revisit, and with the first tree of a column.
+late = [take_ancestors, best_after_resampling, agreement, classify_new]
+assert all(kernel.signatures for kernel in late), [kernel.signatures for kernel in late]
 before = seen()
 assert len(before) > 20, before
 warm_up()
 session = new_session()
-session.open(Open("sim:stand?duration=3", "auto", 0))
+session.open(Open("sim:stand?duration=1", "auto", 0))
 session.set_parameters(Parameters(), 0)
-session.advance(30)
+session.advance(10)
 while session.pace == "hurry":
     session.work()
 for revision, change in enumerate([{"classification.tree_share": 0.7}, {"detection.e_max": 20.0}]):
