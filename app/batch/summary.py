@@ -303,6 +303,8 @@ def summary_lines(
     scans = count(frame.index + 1, "scan")
     with_dbh = int(np.count_nonzero(frame.trees.confirmed & np.isfinite(frame.trees.dbh)))
     mapped = f"{count(trees, 'tree')}, {with_dbh} of them with a DBH"
+    if trees and not with_dbh:
+        mapped += " (a DBH needs views of more sides of the trunk)"
     lines = [f"{uri}: {scans}, {seconds:.1f} s, {metres:.1f} m driven, {mapped}"]
     if evaluation is not None:
         lines += evaluation_lines(evaluation)

@@ -85,8 +85,9 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         )
     seen = within_reach(recorded, parameters)
     if not len(seen.place):
+        is_still = run.record.get("distance_m") == 0.0
         raise StemmapError(
-            "no area was observed within reach",
+            f"no area was observed within reach{': the sensor did not move' if is_still else ''}",
             where=str(folder),
             remedy="Map more of it, or allow a greater reach (--reach) or fewer views (--views-min)",
         )
