@@ -122,7 +122,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
         tree: The nearest confirmed tree within `slam.distance_max`, or that of the candidate; None if there
             is none.
         column: Classification of the accumulated scans at the position; None if there is none.
-        further: What an extension tells of it, by its name.
+        extensions: Explanations by extensions, by the name of the extension.
     """
 
     scan: int
@@ -141,7 +141,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
     axes: list[tuple[float, float]] = []
     tree: int | None = None
     column: ColumnStory | None = None
-    further: dict[str, Any] = {}
+    extensions: dict[str, Any] = {}
 
 
 class History(msgspec.Struct, frozen=True):
@@ -196,7 +196,7 @@ class TreeStory(msgspec.Struct, frozen=True):
         points: Accumulated points around the tree: x, y relative to the position of the tree along the axes
             of the map, and height above the ground [m], see `app.explain.build.points_around`; may be empty.
         history: Estimates in order of time.
-        further: What an extension tells of it, by its name.
+        extensions: Explanations by extensions, by the name of the extension.
     """
 
     tree: int
@@ -218,7 +218,7 @@ class TreeStory(msgspec.Struct, frozen=True):
     column: ColumnStory | None = None
     points: list[tuple[float, float, float]] = []
     history: History = History()
-    further: dict[str, Any] = {}
+    extensions: dict[str, Any] = {}
 
 
 def half_axes(covariance: Float) -> Float:

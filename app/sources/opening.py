@@ -127,13 +127,13 @@ def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -
         slow = os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL)
         what = "it takes too long to be read" if slow else "the reader ended without an answer"
         raise SourceError(what, where=where, remedy=_DAMAGED)
-    told: tuple[str, str, str] | bool | None = msgspec.json.decode(
+    outcome: tuple[str, str, str] | bool | None = msgspec.json.decode(
         answer, type=tuple[str, str, str] | bool | None
     )
-    if isinstance(told, tuple):
-        what, place, remedy = told
+    if isinstance(outcome, tuple):
+        what, place, remedy = outcome
         raise SourceError(what, where=place, remedy=remedy)
-    return told
+    return outcome
 
 
 def _answer(receiving: int, wall_s: float) -> bytes | None:
@@ -158,7 +158,7 @@ def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sen
     """
     import resource
 
-    told: tuple[str, str, str] | bool | None = None
+    outcome: tuple[str, str, str] | bool | None = None
     try:
         faulthandler.disable()
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
@@ -172,14 +172,14 @@ def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sen
         resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 1))
         resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + limits.memory,) * 2)
         result = work()
-        told = result if isinstance(result, bool) else None
+        outcome = result if isinstance(result, bool) else None
     except StemmapError as raised:
-        told = raised.what, raised.where, raised.remedy
+        outcome = raised.what, raised.where, raised.remedy
     except MemoryError:
-        told = "it takes more memory than a file of its size should", where, _DAMAGED
+        outcome = "it takes more memory than a file of its size should", where, _DAMAGED
     except BaseException:
         os._exit(1)
-    os.write(sending, msgspec.json.encode(told))
+    os.write(sending, msgspec.json.encode(outcome))
     os._exit(0)
 
 
@@ -228,7 +228,7 @@ def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
     on Linux in a child process with limits. Of a file that cannot be read or takes too long, its format
     decides."""
     kind = points_format(uri)
-    if kind is None or not kind.is_told_by_contents or (options is not None and options.form != "auto"):
+    if kind is None or not kind.depends_on_contents or (options is not None and options.form != "auto"):
         return _is_cloud(uri, options)
     try:
         found = _check(lambda: _is_cloud(uri, options), uri)

@@ -47,7 +47,7 @@ class CrossSection(msgspec.Struct, frozen=True):
 
 
 class StemOfCloud(msgspec.Struct, frozen=True):
-    """What a story tells of a stem of a whole cloud.
+    """Explanation of a stem of a whole cloud.
 
     Attributes:
         sections: Cross-sections of the candidate, lowest first.
@@ -94,7 +94,7 @@ def tree_story(plot: PlotMap, frame: Frame, row: int, parameters: Parameters) ->
         dbh_arc_deg=parameters.tracking.dbh_arc_min,
         observations=int(trees.observations[row]),
         cluster=candidate,
-        further={NAME: stem},
+        extensions={NAME: stem},
     )
 
 
@@ -114,7 +114,7 @@ def cluster_story(plot: PlotMap, frame: Frame, row: int, parameters: Parameters)
         size=int(frame.clusters.size[row]),
         position=(float(place[0]), float(place[1])),
         tree=int(frame.trees.number[tree[0]]) if len(tree) else None,
-        further={NAME: StemOfCloud(cross_sections(plot, row))},
+        extensions={NAME: StemOfCloud(cross_sections(plot, row))},
     )
 
 

@@ -175,7 +175,7 @@ class Format:
         open: Function of URI, path and options that opens the source.
         is_cloud: Whether it is usually a whole cloud.
         holds_points: Whether it is a file of points: a whole cloud or one scan.
-        is_told_by_contents: Whether its contents tell which of them, see `cloud_or_scan`.
+        depends_on_contents: Whether its contents decide which of them, see `cloud_or_scan`.
     """
 
     words: str
@@ -184,14 +184,14 @@ class Format:
     open: Opener
     is_cloud: bool = False
     holds_points: bool = False
-    is_told_by_contents: bool = False
+    depends_on_contents: bool = False
 
 
 def _points(
-    words: str, magic: tuple[bytes, ...], *suffixes: str, is_cloud: bool = True, told: bool = True
+    words: str, magic: tuple[bytes, ...], *suffixes: str, is_cloud: bool = True, by_contents: bool = True
 ) -> Format:
     """Return a format of files of points, see `Format`."""
-    return Format(words, magic, suffixes, _cloud if is_cloud else _scans, is_cloud, True, told)
+    return Format(words, magic, suffixes, _cloud if is_cloud else _scans, is_cloud, True, by_contents)
 
 
 _PCAP = (
@@ -203,12 +203,14 @@ FILES = (
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
     Format("Velodyne, Hesai or Ouster .pcap", _PCAP, (".pcap",), _opener("capture", "open_capture")),
     _points(".pcd (whole cloud or scan)", (b"# .PCD", b"VERSION", b"FIELDS"), ".pcd", is_cloud=False),
-    _points("whole cloud .laz or .las", (b"LASF",), ".laz", ".las", told=False),
-    _points("whole cloud .e57", (b"ASTM-E57",), ".e57", told=False),
+    _points("whole cloud .laz or .las", (b"LASF",), ".laz", ".las", by_contents=False),
+    _points("whole cloud .e57", (b"ASTM-E57",), ".e57", by_contents=False),
     _points("whole cloud .ply", (b"ply\n", b"ply\r"), ".ply"),
     _points("whole cloud .npy or .npz", (b"\x93NUMPY",), ".npy", ".npz"),
     _points("KITTI .bin", (), ".bin", is_cloud=False),
-    _points("whole cloud as text (.xyz, .txt, .asc, .csv, .pts)", (), ".xyz", ".asc", ".pts", told=False),
+    _points(
+        "whole cloud as text (.xyz, .txt, .asc, .csv, .pts)", (), ".xyz", ".asc", ".pts", by_contents=False
+    ),
 )
 
 _MOST_NAMED = 5
@@ -306,7 +308,7 @@ def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
     kind, form = points_format(uri), "auto" if options is None else options.form
     if kind is None or form != "auto":
         return kind is not None and form == "cloud"
-    if not kind.is_told_by_contents:
+    if not kind.depends_on_contents:
         return kind.is_cloud
     from pipeline.io.readers.clouds import form_of_file
 

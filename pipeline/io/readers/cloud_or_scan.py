@@ -58,7 +58,7 @@ class Form:
         return f"taken as {kind}, because {self.why}; it can be read as {other}"
 
 
-def is_told_by_points(table: PointTable) -> bool:
+def is_decided_by_points(table: PointTable) -> bool:
     """Return whether the points of a table decide: of PCD and KITTI .bin. PLY and NumPy are formats of whole
     clouds, and scans only if their columns say so."""
     return table.kind.startswith(("PCD", "KITTI"))

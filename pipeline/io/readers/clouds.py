@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import COORDINATE_LIMIT, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.cloud_frame import CloudSample, FileFrame, frame_of, sample_of
-from pipeline.io.readers.cloud_or_scan import Form, form_of, is_told_by_points
+from pipeline.io.readers.cloud_or_scan import Form, form_of, is_decided_by_points
 from pipeline.io.readers.point_files import (
     EXPORT,
     MISSING,
@@ -91,7 +91,7 @@ def form_of_file(path: Path) -> Form:
         OSError: The file cannot be read.
     """
     table = open_points(path)
-    return form_of(table, sample_of(table) if is_told_by_points(table) else None)
+    return form_of(table, sample_of(table) if is_decided_by_points(table) else None)
 
 
 def is_place(xyz: Float) -> NDArray[np.bool_]:
@@ -143,7 +143,7 @@ class PointCloud:
         else:
             raise ScanFileError("the cloud has no points with valid coordinates", EXPORT)
         low, high = _corners(table, sample, frame)
-        form = form_of(table, sample) if options.form == "auto" and is_told_by_points(table) else None
+        form = form_of(table, sample) if options.form == "auto" and is_decided_by_points(table) else None
         self.description = CloudDescription(
             uri,
             table.kind,

@@ -46,9 +46,9 @@ const refresh = keepFresh(async () => {
   let points, votes = "", loaded = "";
   try {
     const told = await story(number);
-    const [further] = ofExtensions("treeEvidence", told);
-    points = further ?? gatheredFigure(told);
-    if (!further) votes = columnFigure(told.column, "Votes on the accumulated scans");
+    const [evidence] = ofExtensions("treeEvidence", told);
+    points = evidence ?? gatheredFigure(told);
+    if (!evidence) votes = columnFigure(told.column, "Votes on the accumulated scans");
     loaded = version;
   } catch (error) {
     points = el("p", { class: "empty", text: capital(error.message) });

@@ -19,8 +19,8 @@ function plain(value, unit) {
 }
 
 export function clusterStory(story) {
-  const told = ofExtensions("clusterStory", story);
-  if (told.length) return told;
+  const own = ofExtensions("clusterStory", story);
+  if (own.length) return own;
   return [verdict(story, why(story)), drawing(story), story.circle ? residuals(story) : "", checks(story),
     columnFigure(story.column, "Accumulated scans at this place")];
 }

@@ -12,8 +12,8 @@ import { gatheredFigure } from "./gathered.js";
 const TURN = 2 * Math.PI;
 
 export function treeStory(story, showCluster) {
-  const told = ofExtensions("treeStory", story);
-  if (told.length) return told;
+  const own = ofExtensions("treeStory", story);
+  if (own.length) return own;
   return [verdict(story), overview(story, showCluster), gatheredFigure(story), positions(story), columnFigure(story.column, "Verdict on the accumulated scans")];
 }
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path as FilePath
 
 import numpy as np
 
+from app.batch.run_folder import read_run
+from app.store.records import Author, Content
+from app.store.store import Store
 from pipeline.config import Parameters
 from pipeline.io.result_files import RunFiles, csv_text, seen_text
 from pipeline.seen_area import CELL, SeenArea
@@ -77,6 +81,15 @@ def write_run(folder, position, dbh, *, dbh_sigma=0.01, side=20.0, seen=True, nu
         more["seen.csv"] = seen_text(area)
     RunFiles(folder).finish(trees, path, 0, run, None, more)
     return folder
+
+
+def reject_on_page(folder, data_folder):
+    """Reject the first tree of a run as a person does on the page, in the database of the data folder."""
+    run = read_run(folder)
+    x, y = run.trees.position[0].tolist()
+    with closing(Store(data_folder)) as store:
+        number = store.open_run(run.record["source"].get("sha256") or run.uri, run.uri, "grid")
+        store.add(number, Author("a" * 16, "Ann"), [Content(x, y, "pole")])
 
 
 def grid_run(folder, *, seen=True, cloud_crs=None):

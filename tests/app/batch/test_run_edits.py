@@ -10,10 +10,10 @@ import pytest
 
 from app.batch.run_edits import SAME_THING, reviewed_run, reviews_of
 from app.batch.run_folder import read_run, read_terrain
-from app.store.records import SKIPPED, Author, Content
+from app.store.records import FRAME, SKIPPED, Author, Content
 from app.store.store import Store
 from pipeline.errors import SourceError
-from tests.app.batch.finished_runs import grid_run
+from tests.app.batch.finished_runs import grid_run, reject_on_page
 from tests.app.cli.test_commands import stemmap
 
 PLACES = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
@@ -84,12 +84,7 @@ def test_an_unknown_review_is_refused(tmp_path):
 def test_an_export_has_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path / "kept"))
     folder = grid_run(tmp_path / "run")
-    run = read_run(folder)
-    x, y = run.trees.position[0].tolist()
-    store = Store(tmp_path / "kept")
-    number = store.open_run(run.record["source"].get("sha256") or run.uri, run.uri, "grid")
-    store.add(number, Author("a" * 16, "Ann"), [Content(x, y, "pole")])
-    store.close()
+    reject_on_page(folder, tmp_path / "kept")
     exported = tmp_path / "trees.geojson"
     result = stemmap(capsys, "export", folder, "--to", exported)
     assert (result.code, result.err) == (0, "review: 1 tree rejected on the page left out\n")
@@ -98,9 +93,12 @@ def test_an_export_has_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
     assert len(features) == 99
 
 
-@pytest.mark.parametrize("was_reviewed_here", [False, True])
-def test_reviews_in_the_files_count_until_the_recording_is_annotated_here(
-    tmp_path, capsys, monkeypatch, was_reviewed_here
+@pytest.mark.parametrize(
+    ("kind", "exported_trees"),
+    [("", 99), ("of an extension", 99), (FRAME, 99), ("pole", 100)],  # all are undone
+)
+def test_reviews_in_the_files_count_until_a_tree_is_reviewed_here(
+    tmp_path, capsys, monkeypatch, kind, exported_trees
 ):
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path / "kept"))
     folder = grid_run(tmp_path / "run")
@@ -109,10 +107,10 @@ def test_reviews_in_the_files_count_until_the_recording_is_annotated_here(
     run = read_run(folder)
     with closing(Store(tmp_path / "kept")) as store:
         number = store.open_run(run.record["source"]["sha256"], run.uri, "grid")
-        if was_reviewed_here:
+        if kind:
             author = Author("a" * 16, "Ann")
-            store.add(number, author, [Content(1.0, 1.0, "pole")])
+            store.add(number, author, [Content(1.0, 1.0, kind)])
             store.undo(number, author)
     exported = tmp_path / "trees.geojson"
     stemmap(capsys, "export", folder, "--to", exported)
-    assert len(json.loads(exported.read_text())["features"]) == (100 if was_reviewed_here else 99)
+    assert len(json.loads(exported.read_text())["features"]) == exported_trees

@@ -81,5 +81,5 @@ def tree_story(number: int) -> TreeStory:
         column=None,
         points=[(0.15, 0.0, 1.3)],
         history=History([0.5], [1.0], [2.0], [0.02], [0.01], [0.3], [0.3], [0.01]),
-        further={"lines": {"height": 14.0}},
+        extensions={"lines": {"height": 14.0}},
     )

@@ -337,7 +337,7 @@ def _too_thick(verdict: Int32, r_max: float) -> list[str]:
 
 
 def _unit_doubt(about: CloudDescription, dbh: Float, above: Float32) -> list[str]:
-    """Return a warning if the numbers of a cloud whose file names no unit are hardly metres.
+    """Return a warning if the numbers of a cloud whose file names no unit are implausible in metres.
 
     Args:
         about: Description of the cloud.

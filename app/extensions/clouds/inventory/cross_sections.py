@@ -318,18 +318,22 @@ def points_around(slices: Slices, first: int, last: int, x: float, y: float, rea
 
 # --- columns and the circles along them ---
 
-LEAST = 12  # points on a circle; with fewer, chance places circles above one another
-ENOUGH = 2 * LEAST  # points that a slice of a sparse cloud shall have
-MORE = 4  # steps (0.8 m) up and down from which a slice may take points; a stem hardly tapers within them
-OWN = 3  # points on the circle at the height of the slice itself, which no neighbour can replace
-VOTES = LEAST / 2.0  # of the first circle; points with the noise of a mobile scanner have half a vote each
-SAMPLE = 32  # columns in which the cloud is measured
-CLEAR = 10.0  # contrast of a circle with hardly a point beside it
-EXACT = 0.01  # m; a scatter down to this is bark, and not a property of the scanner
-FUZZY = 1.75  # largest scatter of a circle as a multiple of the noise; foliage around a stem adds to it
+MIN_POINTS = 12  # points on a circle; with fewer, chance places circles above one another
+ENOUGH_POINTS = 2 * MIN_POINTS  # points that a slice of a sparse cloud shall have
+NEIGHBOUR_STEPS = (
+    4  # steps (0.8 m) up and down from which a slice may take points; a stem hardly tapers within them
+)
+MIN_OWN_POINTS = 3  # points on the circle at the height of the slice itself, which no neighbour can replace
+VOTES = (
+    MIN_POINTS / 2.0
+)  # of the first circle; points with the noise of a mobile scanner have half a vote each
+SAMPLED_COLUMNS = 32  # columns in which the cloud is measured
+CLEAR_CONTRAST = 10.0  # contrast of a circle with few points beside it
+BARK_SCATTER = 0.01  # m; a scatter down to this is bark, and not a property of the scanner
+MAX_SCATTER = 1.75  # largest scatter of a circle as a multiple of the noise; foliage around a stem adds to it
 UNROUND = 0.05  # scatter by the shape of a cross-section, as a share of the radius
-ARC = np.radians(70.0)  # least arc of a circle of a stem
-HOLLOW = 0.25  # largest share of points inside of a circle
+MIN_ARC = np.radians(70.0)  # least arc of a circle of a stem
+MAX_INSIDE = 0.25  # largest share of points inside of a circle
 NOISE = 0.03  # m; noise of mobile scanners
 ALIKE = 0.3  # largest change of centre and radius between neighbouring slices, as a share of the radius
 LOST = 5  # slices (1 m) without a circle after which a stem ends
@@ -430,9 +434,9 @@ class Sampling(NamedTuple):
 
 
 def measure_sampling(slices: Slices, axes: Float, r_min: float, r_max: float) -> Sampling:
-    """Return the median scatter of the clear circles along the first SAMPLE columns, at least EXACT, and the
-    number of points below which a slice takes points of its neighbours: ENOUGH if half of these circles have
-    fewer points, else LEAST. Without a clear circle the scatter is NOISE.
+    """Return the median scatter of the clear circles along the first SAMPLED_COLUMNS columns, at least
+    BARK_SCATTER, and the number of points below which a slice takes points of its neighbours: ENOUGH_POINTS
+    if half of these circles have fewer points, else MIN_POINTS. Without a clear circle the scatter is NOISE.
 
     In a dense cloud a slice with few points is the edge of a bush rather than a stem.
 
@@ -441,13 +445,13 @@ def measure_sampling(slices: Slices, axes: Float, r_min: float, r_max: float) ->
         axes: Columns, strongest first, see `find_columns`.
         r_min, r_max: Minimum and maximum radius [m].
     """
-    circles = trace(slices, axes[:SAMPLE], r_min, r_max, Sampling(NOISE, LEAST))
+    circles = trace(slices, axes[:SAMPLED_COLUMNS], r_min, r_max, Sampling(NOISE, MIN_POINTS))
     with np.errstate(invalid="ignore"):
-        clear = circles[circles[..., 10] > CLEAR]
+        clear = circles[circles[..., 10] > CLEAR_CONTRAST]
     if not len(clear):
-        return Sampling(NOISE, LEAST)
+        return Sampling(NOISE, MIN_POINTS)
     scatter, points = np.median(clear[:, [7, 9]], axis=0).tolist()
-    return Sampling(max(scatter, EXACT), ENOUGH if points < ENOUGH else LEAST)
+    return Sampling(max(scatter, BARK_SCATTER), ENOUGH_POINTS if points < ENOUGH_POINTS else MIN_POINTS)
 
 
 def trace(slices: Slices, axes: Float, r_min: float, r_max: float, sampling: Sampling) -> Float:
@@ -529,7 +533,7 @@ def _first_circle(slices: Slices, axis: Float, window: Int, r_min: float, larges
         # The axis of a column is inside of the stem or on its bark.
         near = points_around(slices, step, step + 1, at[0], at[1], 2.0 * largest + SIDE)
         shifted = np.concatenate((shifted, near - at))
-    return bool(shifted.shape[0] >= LEAST and best_circle(shifted, NOISE, r_min, largest, row) >= VOTES)
+    return bool(shifted.shape[0] >= MIN_POINTS and best_circle(shifted, NOISE, r_min, largest, row) >= VOTES)
 
 
 @compiled
@@ -600,7 +604,7 @@ def _fits(
 ) -> bool:
     """Fit the circle of a slice; return whether it can belong to the stem. If not, the position and the
     radius are unchanged, and the other values are undefined. A slice with few points in which no circle fits
-    takes those of its neighbours, up to ENOUGH points or MORE steps.
+    takes those of its neighbours, up to ENOUGH_POINTS points or NEIGHBOUR_STEPS steps.
 
     Args:
         slices: Slices of the plot.
@@ -613,11 +617,11 @@ def _fits(
     x, y, r = row[0], row[1], row[2]
     near = _upright(slices, k, 0, row, lean)
     own = near.shape[0]
-    for more in range(MORE + 1):
+    for more in range(NEIGHBOUR_STEPS + 1):
         if more > 0:
             near = np.concatenate((near, _upright(slices, k, more, row, lean)))
-        full = near.shape[0] >= ENOUGH
-        if near.shape[0] >= LEAST and (more == 0 or full or more == MORE):
+        full = near.shape[0] >= ENOUGH_POINTS
+        if near.shape[0] >= MIN_POINTS and (more == 0 or full or more == NEIGHBOUR_STEPS):
             if _continues(near, own, row, r_min, r_max, sampling.noise):
                 return True
             row[0], row[1], row[2] = x, y, r
@@ -644,9 +648,9 @@ def _continues(near: Float, own: int, row: Float, r_min: float, r_max: float, no
         fit_circle(near, slack, r_min, r_max, row)
         and np.sqrt((row[0] - x) ** 2 + (row[1] - y) ** 2) < slack
         and abs(row[2] - r) < slack
-        and row[9] >= LEAST
-        and row[8] >= ARC
-        and row[7] < np.sqrt((FUZZY * noise) ** 2 + (UNROUND * row[2]) ** 2)
-        and share_inside(near, row[0], row[1], row[2]) <= HOLLOW
-        and _coverage(near[:own], row[0], row[1], row[2], 3.0 * row[7])[1] >= OWN
+        and row[9] >= MIN_POINTS
+        and row[8] >= MIN_ARC
+        and row[7] < np.sqrt((MAX_SCATTER * noise) ** 2 + (UNROUND * row[2]) ** 2)
+        and share_inside(near, row[0], row[1], row[2]) <= MAX_INSIDE
+        and _coverage(near[:own], row[0], row[1], row[2], 3.0 * row[7])[1] >= MIN_OWN_POINTS
     )

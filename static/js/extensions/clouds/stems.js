@@ -10,7 +10,7 @@ const SIZE = 120; // of the picture of a section
 const BREAST = 1.3; // [m]
 
 export function treeStory(story) {
-  const stem = story.further.clouds;
+  const stem = story.extensions.clouds;
   if (!stem) return [];
   return [el("div", { class: "verdict", "data-verdict": "tree" }, letterOf(verdictOf("tree")),
     el("div", {}, el("b", { text: "tree" }), el("p", { text: `Circles in ${count(story.observations, "slice")} above one another, between ${figure(stem.sections[0].height)} and ${figure(stem.sections.at(-1).height)} m above the ground.` }))),
@@ -18,12 +18,12 @@ export function treeStory(story) {
 }
 
 export function clusterStory(story) {
-  const stem = story.further.clouds;
+  const stem = story.extensions.clouds;
   return stem ? [verdict(story, why(story)), sectionsFigure(stem.sections), checks(story)] : [];
 }
 
-export function treeEvidence({ further }) {
-  return further.clouds ? [sectionsFigure(further.clouds.sections)] : [];
+export function treeEvidence({ extensions }) {
+  return extensions.clouds ? [sectionsFigure(extensions.clouds.sections)] : [];
 }
 
 function why(story) {

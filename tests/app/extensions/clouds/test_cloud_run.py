@@ -165,7 +165,7 @@ def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session
     frame = mapped(session)
     for row, number in enumerate(frame.trees.number.tolist()):
         story = cloud_run(session).tree_story(number)
-        stem = story.further["clouds"]
+        stem = story.extensions["clouds"]
         assert len(stem.sections) == frame.trees.observations[row]
         heights = [section.height for section in stem.sections]
         assert heights == sorted(heights)
@@ -210,7 +210,7 @@ def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(sessio
         else:
             assert failed == [] or story.verdict == failed[0]
             others += 1
-        assert story.further["clouds"].sections
+        assert story.extensions["clouds"].sections
         assert (story.tree is not None) == (story.verdict == "tree")
     assert others == 3, "bushes"
     with pytest.raises(StemmapError, match="no cluster"):
