@@ -15,10 +15,10 @@ from app.explain.records import half_axes
 from app.worker.course import QUANTITIES
 from app.worker.protocol import RunCourse, Shown
 from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict
+from pipeline.types.units import SECOND_NS
 
 Float = NDArray[np.float64]
 
-_NS = 1_000_000_000
 # 0.1 mm: finer than any sensor, and short in JSON.
 _DIGITS = 4
 
@@ -46,7 +46,7 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         "sigma_xy": round(estimate.sigma_xy, _DIGITS),
         "n_eff": round(estimate.n_eff, 1),
         "health": health_payload(frame.health),
-        "trees": trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * _NS)),
+        "trees": trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * SECOND_NS)),
         "clusters": clusters_payload(frame),
         "counts": dict(frame.counts),
         **counts_of(frame, truth, match_distance),
@@ -151,8 +151,8 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
         "eccentricity": _finite(trees.eccentricity[keep]),
         "observations": trees.observations[keep].tolist(),
         "coverage_deg": _finite(np.degrees(trees.coverage[keep])),
-        "first_seen_s": _rounded((trees.first_seen_ns[keep] - start_ns) / _NS),
-        "last_seen_s": _rounded((trees.last_seen_ns[keep] - start_ns) / _NS),
+        "first_seen_s": _rounded((trees.first_seen_ns[keep] - start_ns) / SECOND_NS),
+        "last_seen_s": _rounded((trees.last_seen_ns[keep] - start_ns) / SECOND_NS),
         "height_m": _finite((unknown if trees.height is None else trees.height)[keep]),
         "sigma_height_m": _finite((unknown if trees.height_sigma is None else trees.height_sigma)[keep]),
         "lean_deg": _finite(lean[keep]),

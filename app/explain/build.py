@@ -37,12 +37,12 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.columns import evenly_spaced
 from pipeline.geometry.poses import Float
 from pipeline.types.records import Clusters, Frame, Sensor, Verdict
+from pipeline.types.units import SECOND_NS
 
 if TYPE_CHECKING:
     from app.worker.run import Run
 
 
-_NS = 1_000_000_000
 _MOST_POINTS = 400
 _MOST_FEATURES = 6
 _COLUMN_REACH = 0.45  # [m]; a column farther away belongs to another object
@@ -86,7 +86,7 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
     return ClusterStory(
         scan=frame.index,
         cluster=cluster,
-        time_s=(frame.stamp_ns - run.start_ns) / _NS,
+        time_s=(frame.stamp_ns - run.start_ns) / SECOND_NS,
         verdict=Verdict(int(clusters.verdict[cluster])).label,
         checks=checks_of(clusters, cluster, parameters),
         size=int(clusters.size[cluster]),
@@ -128,7 +128,7 @@ def tree_story(run: Run | None, frame: Frame | None, number: int) -> TreeStory:
     return TreeStory(
         tree=int(trees.number[row]),
         scan=frame.index,
-        time_s=(frame.stamp_ns - run.start_ns) / _NS,
+        time_s=(frame.stamp_ns - run.start_ns) / SECOND_NS,
         confirmed=bool(trees.confirmed[row]),
         position=(float(trees.position[row, 0]), float(trees.position[row, 1])),
         ellipse=(major, minor, angle),
@@ -139,8 +139,8 @@ def tree_story(run: Run | None, frame: Frame | None, number: int) -> TreeStory:
         sides=sides,
         eccentricity=float(trees.eccentricity[row]),
         observations=int(trees.observations[row]),
-        first_seen_s=(int(trees.first_seen_ns[row]) - run.start_ns) / _NS,
-        last_seen_s=(int(trees.last_seen_ns[row]) - run.start_ns) / _NS,
+        first_seen_s=(int(trees.first_seen_ns[row]) - run.start_ns) / SECOND_NS,
+        last_seen_s=(int(trees.last_seen_ns[row]) - run.start_ns) / SECOND_NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
         column=column_story(frame, trees.position[row], parameters, _is_seen_all_around(run)),
         points=points_around(run.voxels, trees.position[row]),

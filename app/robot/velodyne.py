@@ -14,11 +14,11 @@ from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.topics import VELODYNE_SCAN, standard_types
 from pipeline.io.readers.velodyne import GAP_NS, PACKET_BYTES, PRODUCT, Rotation, is_data_packet
+from pipeline.types.units import SECOND_NS
 
 #: The fastest sensor (VLS-128, dual return) sends fewer packets in the slowest turn.
 MOST_PACKETS = 4000
 FRAME = "velodyne"
-_SECOND = 1_000_000_000
 
 
 class Sweeps:
@@ -72,7 +72,7 @@ def _message(packets: list[tuple[int, bytes]]) -> bytes:
 
 def _time(store: Any, stamp_ns: int) -> Any:  # noqa: ANN401
     """Return a time [ns] as builtin_interfaces/Time."""
-    return store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // _SECOND, nanosec=stamp_ns % _SECOND)
+    return store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // SECOND_NS, nanosec=stamp_ns % SECOND_NS)
 
 
 TOPIC = "/velodyne_packets"

@@ -17,6 +17,7 @@ from app.explain.records import History, half_axes
 from app.worker.protocol import RunCounts
 from pipeline.geometry.columns import GrowingColumns
 from pipeline.types.records import Float, Frame, Int, Verdict
+from pipeline.types.units import SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +240,6 @@ _SCAN, _NUMBER, _OBSERVATIONS, _TIME = range(4)
 _MOST_ROWS = 200_000
 _ALL_OF_FIRST = 10  # observations; there the ellipse shrinks fastest
 _MOST_RETURNED = 200  # rows
-_NS = 1_000_000_000
 
 
 class TreeHistory:
@@ -314,7 +314,7 @@ def _rows_of(frame: Frame, start_ns: int) -> Float:
             np.full(len(rows), frame.index),
             trees.number[rows],
             trees.observations[rows],
-            np.full(len(rows), (frame.stamp_ns - start_ns) / _NS),
+            np.full(len(rows), (frame.stamp_ns - start_ns) / SECOND_NS),
             trees.position[rows],
             trees.covariance[rows][:, [0, 0, 1], [0, 1, 1]],
             trees.dbh[rows],

@@ -36,6 +36,7 @@ from app.worker.session import Session, camera_picture, tree_picture
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame
+from pipeline.types.units import SECOND_NS
 
 Put = Callable[[protocol.FromWorker], None]
 T = TypeVar("T")
@@ -507,7 +508,6 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
             return protocol.Answer(ticket, cluster=cluster_story(run, frame, cluster))
 
 
-NS = 1_000_000_000
 RATE_SCANS = 20  # scans over which the rate is measured
 SLOWEST = 1e-3  # factor of real time; a smaller one would give times that no clock can wait for
 LONGEST_DELAY_S = 3600.0
@@ -567,7 +567,7 @@ class ReplayClock:
             return 0
         first, last = self._mapped[0][0], self._mapped[-1][0]
         period_ns = (last - first) / (len(self._mapped) - 1)
-        late_ns = (now - self._due(last)) * self.speed * NS
+        late_ns = (now - self._due(last)) * self.speed * SECOND_NS
         return max(0, int(late_ns / period_ns)) if period_ns > 0 else 0
 
     @property
@@ -584,4 +584,4 @@ class ReplayClock:
         if self._anchor is None:
             raise RuntimeError("the replay clock has no anchor")
         anchor_ns, anchor_s = self._anchor
-        return anchor_s + (stamp_ns - anchor_ns) / NS / self.speed
+        return anchor_s + (stamp_ns - anchor_ns) / SECOND_NS / self.speed

@@ -35,6 +35,7 @@ from pipeline.remapping.preview import ClusterTable
 from pipeline.remapping.rerun import Rerun, Segment
 from pipeline.seen_area import ViewSelection
 from pipeline.types.records import Columns, Float, Float32, Frame, Path, Step, Trees, Verdict
+from pipeline.types.units import SECOND_NS
 
 MOST_FRAME_BYTES = 1 << 30  # of the frames of one map; a scan takes 20 to 100 kB
 
@@ -167,7 +168,6 @@ class FrameStore:
 
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
-NS = 1_000_000_000
 
 
 class RunMap:
@@ -228,7 +228,7 @@ class RunMap:
         self.history.record(frame, start_ns)
         self.clusters.record(frame)
         self.counts.record(frame)
-        time_s = (frame.stamp_ns - start_ns) / NS
+        time_s = (frame.stamp_ns - start_ns) / SECOND_NS
         self.course.record(frame.index, {"time_s": time_s, **read_quantities(frame), **times})
         if time_s <= self._time_s:
             self.confirmed_s = {number: at for number, at in self.confirmed_s.items() if at < time_s}

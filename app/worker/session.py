@@ -40,12 +40,12 @@ from pipeline.io.readers.camera import SHOWN_NS, PictureSource
 from pipeline.io.readers.topics import COMPRESSED_IMAGE, IMAGE
 from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.types.records import Float, Frame, Path, Trees
+from pipeline.types.units import SECOND_NS
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
 Pace = Literal["idle", "replay", "hurry", "live"]
 AnyRun = Run | OneStepRun
 
-_NS = 1_000_000_000
 _MOST_WARNINGS = 20
 
 
@@ -147,7 +147,9 @@ class Session:
     def time_s(self) -> float:
         """Time of the scan of `frame` since the first scan of the run [s]; 0 before the first scan."""
         frame = self.frame
-        return 0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / _NS
+        return (
+            0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / SECOND_NS
+        )
 
     @property
     def run(self) -> AnyRun | None:
@@ -330,7 +332,7 @@ class Session:
         if self._state != "playing":
             self._settle()
         seconds = min(max(time_s, 0.0), LONGEST_S)
-        self._target.to_time(self._run, self._run.start_ns + round(seconds * _NS))
+        self._target.to_time(self._run, self._run.start_ns + round(seconds * SECOND_NS))
         return self._show_kept(self._run)
 
     def _show_kept(self, run: AnyRun) -> Frame | None:
@@ -540,7 +542,7 @@ def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | Non
         status,
         kind=description.kind,
         odometry=run.odometry,
-        end_s=None if description.end_ns is None else (description.end_ns - run.start_ns) / _NS,
+        end_s=None if description.end_ns is None else (description.end_ns - run.start_ns) / SECOND_NS,
         scan_index=-1 if frame is None else frame.index,
         scans=description.scans,
         mapping_ms=round(run.stopwatch.scan_ms, 3),
@@ -569,7 +571,7 @@ def opened_of(run: AnyRun) -> Opened:
     truth = run.source.truth()
     end_s = None
     if description.start_ns is not None and description.end_ns is not None:
-        end_s = (description.end_ns - description.start_ns) / _NS
+        end_s = (description.end_ns - description.start_ns) / SECOND_NS
     return Opened(
         uri=description.uri,
         kind=description.kind,
@@ -656,9 +658,9 @@ class SeekTarget:
         if run is None:
             return None
         if self._stamp_ns is not None:
-            return (self._stamp_ns - run.start_ns) / _NS
+            return (self._stamp_ns - run.start_ns) / SECOND_NS
         if self._index is not None and self._index < run.known:
-            return (run.stamp_ns(self._index) - run.start_ns) / _NS
+            return (run.stamp_ns(self._index) - run.start_ns) / SECOND_NS
         return None
 
 

@@ -31,13 +31,14 @@ from pipeline.io.readers.camera import (
     time_beside,
 )
 from pipeline.io.readers.container import Channel, Container, Message
-from pipeline.io.readers.message_time import SECOND_NS, header_stamp
+from pipeline.io.readers.message_time import header_stamp
 from pipeline.io.readers.ouster import with_packets_decoded
 from pipeline.io.readers.ros import EmptyScansError, RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
 from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed, standard_types
 from pipeline.io.readers.transforms import Extrinsics, TransformTree
 from pipeline.types.records import Notice, Record
+from pipeline.types.units import SECOND_NS
 
 #: The source is described this long after the first scan, or after this many scans: then its topics and
 #: extrinsics are known.

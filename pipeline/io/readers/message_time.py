@@ -11,8 +11,8 @@ from typing import Generic, TypeVar
 
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
+from pipeline.types.units import SECOND_NS
 
-SECOND_NS = 1_000_000_000
 #: Topics whose stamps, after their delays, differ more from each other use different clocks: a message is
 #: hardly recorded a second after its stamp.
 SAME_CLOCK_NS = SECOND_NS

@@ -26,6 +26,7 @@ from pipeline.io.readers.hesai import ONE_SURFACE
 from pipeline.io.readers.sensor_families import OUSTER, OUSTER_PACKETS
 from pipeline.io.readers.topics import IMU, POINT_CLOUD, TRANSFORMS, TYPES_BY_ROLE, decode, standard_types
 from pipeline.types.records import Bool, Int
+from pipeline.types.units import SECOND_NS
 
 _STRING = "std_msgs/msg/String"
 #: Words that only the metadata of an Ouster have, and their largest size [bytes].
@@ -38,9 +39,8 @@ _MORE = (0, 1)
 _MIXED_FRAMES = 4
 #: Columns of one turn are nearer to each other in time; a turn takes up to 0.2 s [ns].
 _TURN_NS = 1_000_000_000
-_SECOND_NS = 1_000_000_000
 #: A stamp of ROS 2 has 31 bits of seconds.
-_LATEST_NS = (1 << 31) * _SECOND_NS - 1
+_LATEST_NS = (1 << 31) * SECOND_NS - 1
 _MILLIMETRE = 1e-3
 _STRANGE = "packets of another sensor, or damaged"
 _LOST = "packets of the LiDAR that were lost: its scans have gaps"
@@ -272,7 +272,7 @@ class PacketRecording(Container):
         begin_ns = start_ns
         if start_ns is not None and gathering:  # from the packets of the turn before
             slowest = min(int(self._clouds[n].info.format.fps) or 10 for n in gathering)
-            begin_ns = start_ns - 2 * _SECOND_NS // slowest
+            begin_ns = start_ns - 2 * SECOND_NS // slowest
         last_ns = 0
         for message in self._inner.messages(set(numbers) - {self._fixed}, begin_ns, losses):
             last_ns = message.log_ns
@@ -480,7 +480,7 @@ class _Turns:
 
 def _header(store: Any, stamp_ns: int, frame: str) -> Any:  # noqa: ANN401
     """Return a std_msgs/Header."""
-    stamp = store.types["builtin_interfaces/msg/Time"](stamp_ns // _SECOND_NS, stamp_ns % _SECOND_NS)
+    stamp = store.types["builtin_interfaces/msg/Time"](stamp_ns // SECOND_NS, stamp_ns % SECOND_NS)
     return store.types["std_msgs/msg/Header"](stamp, frame)
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from pipeline.io.readers.firing_order import FIRING_ORDER, firing_ns, turn_shares
 from pipeline.types.records import Bool, Float32, Int
+from pipeline.types.units import SECOND_NS
 
-SECOND_NS = 1_000_000_000
 #: Names of fields with the time of a point, in lower case without underscores, in the order of preference.
 TIME_FIELDS = (
     "t", "time", "timestamp", "timeoffset", "offsettime", "timestampoffset", "ts", "dt", "deltatime",

@@ -21,7 +21,6 @@ from pipeline.io.readers.livox import CUSTOM_TYPES
 from pipeline.io.readers.measured_poses import Fix, FrameAlignments
 from pipeline.io.readers.message_time import (
     OPENING_MESSAGES,
-    SECOND_NS,
     Clock,
     Opening,
     Stamped,
@@ -56,6 +55,7 @@ from pipeline.io.readers.topics import (
 from pipeline.io.readers.transforms import MOVING_MESSAGES, Extrinsics, TransformTree, frame_name
 from pipeline.odometry.mounting_yaw import lidar_path, overlap, yaw_of_mounting
 from pipeline.types.records import Imu, Int, Notice, Odometry, Record, Scan, Sensor, Truth
+from pipeline.types.units import SECOND_NS
 
 #: Number of IMU messages in which an orientation is looked for.
 _TRIES = 20

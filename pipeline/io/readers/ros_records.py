@@ -14,7 +14,7 @@ from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.livox import CUSTOM_TYPES, CustomMsg, decode_custom
 from pipeline.io.readers.measured_poses import Fix, GnssFrame, NoPoseError, OtherFrame, OtherPose
-from pipeline.io.readers.message_time import SECOND_NS, header_stamp
+from pipeline.io.readers.message_time import header_stamp
 from pipeline.io.readers.point_times import (
     LONGEST_NS,
     PointTimes,
@@ -43,6 +43,7 @@ from pipeline.io.readers.topics import (
 from pipeline.io.readers.transforms import TransformTree, frame_name, pose_of
 from pipeline.io.readers.velodyne import SENSORS, PacketDecoder, is_data_packet
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor
+from pipeline.types.units import SECOND_NS
 
 if TYPE_CHECKING:
     from rosbags.typesys.stores import ros2_jazzy as ros2

@@ -10,8 +10,8 @@ import numpy as np
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Container, Message
-from pipeline.io.readers.message_time import SECOND_NS
 from pipeline.io.readers.topics import decode
+from pipeline.types.units import SECOND_NS
 
 if TYPE_CHECKING:
     from rosbags.typesys.stores import ros2_jazzy as ros2

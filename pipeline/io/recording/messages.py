@@ -13,10 +13,10 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers.topics import standard_types
 from pipeline.types.records import Clearance, Frame, Imu, Odometry, Path, Scan, Trees, Zone
+from pipeline.types.units import SECOND_NS
 
 ODOM, BASE, LIDAR, CAMERA = "odom", "base_link", "velodyne", "camera"
 
-_SECOND = 1_000_000_000
 _FLOAT32, _UINT16, _INT32 = 7, 4, 5
 Message = Any  # rosbags makes its message classes at run time
 
@@ -50,7 +50,7 @@ def header(stamp_ns: int, frame: str) -> Message:
     Raises:
         StemmapError: ROS cannot represent the time.
     """
-    seconds, rest = divmod(int(stamp_ns), _SECOND)
+    seconds, rest = divmod(int(stamp_ns), SECOND_NS)
     if not 0 <= seconds < 2**31:
         raise StemmapError(
             "a record's time cannot be written as a ROS time",
@@ -116,7 +116,7 @@ def point_cloud(scan: Scan) -> Message:
     if scan.ring is not None:
         columns.append(("ring", "<u2", _UINT16, scan.ring))
     if scan.offset_ns is not None:
-        columns.append(("time", "<f4", _FLOAT32, scan.offset_ns / _SECOND))
+        columns.append(("time", "<f4", _FLOAT32, scan.offset_ns / SECOND_NS))
         columns.append(("t", "<i4", _INT32, scan.offset_ns))
     dtype = np.dtype([(name, code) for name, code, _, _ in columns])
     table = np.empty(len(scan.points), dtype=dtype)

@@ -39,7 +39,7 @@ function labelsIn(mesh, camera, marked) {
 const meet = (a, b) => a[0] < b[2] + GAP && b[0] < a[2] + GAP && a[1] < b[3] + GAP && b[1] < a[3] + GAP;
 
 // Hides the labels that a more important one covers; returns the boxes of those that are seen.
-export function hideCovered(labels) {
+function hideCovered(labels) {
   const ofSelection = labels.filter(({ far }) => far < ABOVE).sort((a, b) => a.far - b.far)[0];
   const seen = [];
   for (const label of labels.sort((a, b) => (b === ofSelection) - (a === ofSelection) || a.near - b.near)) {

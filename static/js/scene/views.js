@@ -22,7 +22,7 @@ function stored() {
 const isView = (view) => Array.isArray(view) && view.length === 6 && view.every(Number.isFinite);
 
 // The saved views of the open source as [[name, view], ...].
-export const savedViews = () => Object.entries(stored()[state.status?.source] ?? {}).filter(([, view]) => isView(view));
+const savedViews = () => Object.entries(stored()[state.status?.source] ?? {}).filter(([, view]) => isView(view));
 
 function keep(views) {
   const source = state.status?.source ?? "", { [source]: _, ...others } = stored(); // this source comes last

@@ -28,7 +28,7 @@ const clipped = (percent) => Math.min(MOST, Math.max(LEAST, Number(percent) || L
 const all = () => ({ ...BUILT_IN, ...saved });
 const same = (one) => Object.keys(STANDARD).every((key) => one[key] === layout[key]);
 
-export function setLayout(changes) {
+function setLayout(changes) {
   layout = { ...layout, ...changes };
   layout.left = clipped(layout.left);
   layout.top = clipped(layout.top);

@@ -320,13 +320,11 @@ def points_around(slices: Slices, first: int, last: int, x: float, y: float, rea
 
 MIN_POINTS = 12  # points on a circle; with fewer, chance places circles above one another
 ENOUGH_POINTS = 2 * MIN_POINTS  # points that a slice of a sparse cloud shall have
-NEIGHBOUR_STEPS = (
-    4  # steps (0.8 m) up and down from which a slice may take points; a stem hardly tapers within them
-)
+# Steps (0.8 m) up and down from which a slice may take points; a stem tapers little within them.
+NEIGHBOUR_STEPS = 4
 MIN_OWN_POINTS = 3  # points on the circle at the height of the slice itself, which no neighbour can replace
-VOTES = (
-    MIN_POINTS / 2.0
-)  # of the first circle; points with the noise of a mobile scanner have half a vote each
+# Votes of the first circle; points with the noise of a mobile scanner have half a vote each.
+VOTES = MIN_POINTS / 2.0
 SAMPLED_COLUMNS = 32  # columns in which the cloud is measured
 CLEAR_CONTRAST = 10.0  # contrast of a circle with few points beside it
 BARK_SCATTER = 0.01  # m; a scatter down to this is bark, and not a property of the scanner

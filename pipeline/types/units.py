@@ -1,0 +1,4 @@
+"""Units of times."""
+
+#: A second [ns].
+SECOND_NS = 1_000_000_000
