@@ -150,7 +150,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
             outcome = map_run(plan, arguments.out)
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
-    return tell(
+    return print_result(
         [*outcome.summary, times],
         arguments.out,
         outcome.warnings,
@@ -160,7 +160,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
     )
 
 
-def tell(
+def print_result(
     summary: list[str],
     out: Path,
     warnings: list[str],

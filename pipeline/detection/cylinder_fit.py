@@ -34,7 +34,7 @@ TUKEY = 3.0  # sigma; residuals beyond have no weight
 BARK = 0.01  # m; roughness of the bark
 BEAM = 0.0015  # rad; half the beam divergence
 #: Of the radius that the returns cover: the lines of a coarse sensor climb, and cross a thin stem from edge
-#: to edge, so that hardly anything beside them is not hit.
+#: to edge, so that little beside them is not hit.
 COARSE_MOST = 0.5
 PRIOR_LEAN_SIGMA = 0.08  # 4.6 degrees; stems beyond twice that are windthrow
 

@@ -187,7 +187,7 @@ class LidarOdometry:
             yield self._notice(now_ns, self._registered_ns, why)
         hidden = not self._is_lost and now_ns - self._shown_ns >= HIDDEN_NS
         if hidden and not self._was_hidden:
-            why = "hardly anything above the ground shows the motion, as in grass without trees"
+            why = "too little above the ground shows the motion, as in grass without trees"
             yield self._notice(now_ns, self._shown_ns, why)
         self._was_hidden = hidden
         contradicted = self._disagreement > CONTRADICTED

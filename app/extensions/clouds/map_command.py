@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     if arguments.stop_after is not None:
         raise ParameterError("a whole cloud has no scans", remedy="Remove --stop-after")
     from app.batch.run_folder import check_folder, partial_output_warnings
-    from app.cli.map import tell
+    from app.cli.map import print_result
     from app.extensions.clouds.inventory import SECTION
     from app.extensions.clouds.result_files import map_plot_run
     from pipeline.io.ground_truth import read_truth_trees
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     cloud = open_cloud(arguments.source, request.options())
     replaces = check_folder(arguments.out, cloud.description.digest, force=arguments.force)
     outcome = map_plot_run(cloud, name, parameters, truth, arguments.out, request.kept_choices())
-    return tell(
+    return print_result(
         outcome.summary,
         arguments.out,
         outcome.warnings,

@@ -315,7 +315,7 @@ def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
     try:
         return form_of_file(Path(uri).expanduser()).is_cloud
     except (ScanFileError, OSError, MemoryError):
-        return kind.is_cloud  # its opening tells the reason
+        return kind.is_cloud  # its opening states the reason
 
 
 def is_recording(path: Path) -> bool:

@@ -1,5 +1,5 @@
 """Times of points from their order: a spinning LiDAR that writes its points as it fires them turns evenly, so
-the azimuth tells the time of a point as a share of a turn.
+the azimuth gives the time of a point as a share of a turn.
 """
 
 from __future__ import annotations

@@ -212,7 +212,7 @@ class Clock:
         Args:
             stamp_ns: Stamp of the message [ns]; None or 0 for none.
             message: The message.
-            frame: Frame of the message, which tells apart two publishers on one topic.
+            frame: Frame of the message, which distinguishes two publishers on one topic.
         """
         number, log_ns = message.channel, message.log_ns
         if number in self._unstamped:

@@ -40,7 +40,7 @@ def mounting_by_ground(scan: Scan, least_tilt: float = _TILTED) -> Pose3 | None:
         scan: The scan.
         least_tilt: A LiDAR that is tilted less is upright [rad].
 
-    The ground is the plane with the most points which has hardly any below it, in each of several samples of
+    The ground is the plane with the most points which has few below it, in each of several samples of
     the points. A wall is such a plane too:
     the LiDAR is upright if a plane on which it would be upright has half as many points or more.
     """
@@ -88,7 +88,7 @@ def assumed_mounting(scan: Scan) -> tuple[Pose3, tuple[str, ...]]:
     found = mounting_by_ground(scan)
     if found is None:
         return Pose3.identity(), ()
-    return found, (f"the recording tells no mounting: {tilt_text(found)}",)
+    return found, (f"the recording has no mounting: {tilt_text(found)}",)
 
 
 def tilt_text(T_base_lidar: Pose3) -> str:
@@ -102,7 +102,7 @@ def tilt_text(T_base_lidar: Pose3) -> str:
 
 def mounting_by_grounds(scans: Sequence[Scan]) -> Pose3 | None:
     """Return T_base_lidar by the ground in scans of a drive, as `mounting_by_ground` does for a LiDAR that is
-    tilted by _KEPT or more. None unless the ground is tilted alike in all of them, as no slope is."""
+    tilted by _KEPT or more. None unless the ground has the same tilt in all of them, as no slope is."""
     found = [mounting_by_ground(scan, _KEPT) for scan in scans]
     ups = np.array([T.R[2] for T in found if T is not None]).reshape(-1, 3)
     if not len(ups) or len(ups) < len(found):

@@ -69,7 +69,7 @@ class Metadata:
 
     def fits(self, packet: bytes, size: int) -> bool:
         """Return whether a packet has a size, one of the driver's bytes more included, and is of this sensor
-        as far as it tells. A sensor that was set up again since has the same number."""
+        as far as it is known. A sensor that was set up again since has the same number."""
         if len(packet) - size not in _MORE:
             return False
         if size != self.format.lidar_packet_size:  # packets of an older IMU have no number

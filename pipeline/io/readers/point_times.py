@@ -1,8 +1,8 @@
 """Times of points: field, unit and clock are decided once for a sensor, by the first scans of its topic.
 
-A sweep lasts about one period between scans, which tells the unit of its times whatever their clock. Times
+A sweep lasts about one period between scans, which gives the unit of its times for any clock. Times
 that stay the same from scan to scan count from the stamp; others are those of a clock. Without a field of
-times, the order of the points may tell them (`firing_order`).
+times, the order of the points may give them (`firing_order`).
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ REFLECTANCE = ("intensity", "intensities", "reflectivity", "reflectance", "i")
 RING = ("ring", "channel", "laser_id")
 #: Columns of clouds that other odometry writes, which may be de-skewed already; no driver has them.
 PROCESSED = frozenset({"curvature", "normal_x"})
-#: Columns that tell which points are returns: the range of Ouster [mm], 0 for no return, and tags of Livox.
+#: Columns that state which points are returns: the range of Ouster [mm], 0 for no return, and tags of Livox.
 RETURNED = ("range", "tag")
 RING_LIMIT = 1024
 

@@ -222,7 +222,7 @@ class ScanFolder(FileSource):
         if 2 * sum(view is not None for view in views) < len(views):
             return None
         self._warnings.append("the motion is that of the sensor in the headers of the files (VIEWPOINT)")
-        # The first sensor is often the origin, which the header cannot tell from no pose.
+        # The first sensor is often the origin, which the header does not distinguish from no pose.
         return [view or (Pose3.identity() if k == 0 else None) for k, view in enumerate(views)]
 
     def _find_frame(self, poses: list[Pose3 | None]) -> None:
@@ -263,7 +263,7 @@ class ScanFolder(FileSource):
                 timed = timed_scan(stamp_ns, self._columns(file, {}))
             except (ScanFileError, OSError):
                 continue
-            # The order of points that were moved to another frame tells no direction of the sensor.
+            # The order of points that were moved to another frame gives no direction of the sensor.
             scans.append(replace(timed, points=None) if file in self._T_file_lidar else timed)
         times, why = decide_point_times(scans)
         if why:
@@ -336,7 +336,7 @@ class ScanFolder(FileSource):
 
 
 def _form_words(file: Path) -> list[str]:
-    """Return why one file is taken as one scan, if its contents tell that; else []."""
+    """Return why one file is taken as one scan, if its contents decide that; else []."""
     try:
         table = open_points(file)
         return [form_of(table, sample_of(table)).words] if table.kind.startswith("PCD") else []

@@ -89,7 +89,7 @@ class ScanFrames:
                     self._odometry.popleft()
             yield record
         elif self._world and record.frame == self._world[0]:
-            # Its points were moved to their places already, so their times tell nothing more.
+            # Its points were moved to their places already, so their times are not needed.
             self._waiting.append(replace(record.scan, offset_ns=None))
         else:
             place = self._place_of(record.frame)

@@ -11,7 +11,7 @@ from pipeline.io.readers.livox import CUSTOM_TYPES
 
 @dataclass(frozen=True, slots=True)
 class SensorFamily:
-    """LiDARs of one maker or kind whose scans are written alike.
+    """LiDARs of one maker or kind whose drivers write scans in one form.
 
     Attributes:
         name: Name of the family.

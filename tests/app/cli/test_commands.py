@@ -526,4 +526,4 @@ def test_the_program_ends_with_the_code_and_all_it_said(tmp_path, library):
 
 @pytest.mark.parametrize(("warning", "code"), [(f"{LOST} since 1.2 s: no scan fits", 3), ("of no harm", 0)])
 def test_a_map_whose_odometry_got_lost_ends_with_exit_code_3(warning, code, tmp_path):
-    assert map_command.tell([], tmp_path, [warning], {}, replaces=False, wrong=(LOST,)) == code
+    assert map_command.print_result([], tmp_path, [warning], {}, replaces=False, wrong=(LOST,)) == code
