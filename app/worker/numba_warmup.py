@@ -190,6 +190,5 @@ if __name__ == "__main__":
     _programs = {"warm_up": warm_up, "map_scene": map_scene, "warm_tree_map": warm_tree_map}
     if sys.argv[1:]:
         run_child(lambda _: _programs[sys.argv[1]]())
-    compile_ahead()
+    warm_up()
     warm_tree_map()
-    map_scene()
