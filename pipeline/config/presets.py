@@ -49,6 +49,7 @@ _PAPER: dict[str, object] = {
     "relocalisation.method": "none",
     "classification.method": "none",
     "tracking.dbh_arc_min": 0.0,
+    "tracking.dbh_sigma_max": 0.5,
     "tracking.velocity_sigma": 0.1,
     "tracking.acceleration_sigma": 0.001,
     "tracking.proximity_radius": 1.0,
@@ -94,6 +95,7 @@ _LASER2D: dict[str, object] = {
     "obstacles.height_max": 10.0,
     "obstacles.width": 2.0,
     "tracking.dbh_arc_min": 0.0,
+    "tracking.dbh_sigma_max": 0.5,
     "tracking.proximity_radius": 1.5,
 }
 
@@ -110,6 +112,7 @@ _STEMS: dict[str, object] = {
     "slam.weight_power": 0.3,
     "classification.method": "none",
     "tracking.dbh_arc_min": 0.0,
+    "tracking.dbh_sigma_max": 0.5,
 }
 
 PRESETS: dict[str, tuple[str, dict[str, object]]] = {

@@ -126,12 +126,14 @@ class FigureLimits(NamedTuple):
     Attributes:
         hits_to_confirm: Minimum number of detections of a tree without a class of a voxel column.
         dbh_arc_min: Minimum observed arc for a diameter [rad].
+        dbh_sigma_max: Maximum standard deviation of a diameter [m].
         out_of_round: Lower bound of the DBH sigma, as a fraction of the DBH.
         taper_sigma: Standard deviation of the taper, change of the diameter per height [m/m].
     """
 
     hits_to_confirm: int
     dbh_arc_min: float
+    dbh_sigma_max: float
     out_of_round: float
     taper_sigma: float
 
@@ -201,8 +203,8 @@ def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) ->
 @compiled_borrowing
 def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tuple[float, float]:
     """Return DBH [m] and its standard deviation [m] of the tree in row t; both NaN with fewer than
-    DBH_OBSERVATIONS radii, an observed arc below `limits.dbh_arc_min`, or a diameter below RESOLVED distances
-    between returns at the mean distance of the views.
+    DBH_OBSERVATIONS radii, an observed arc below `limits.dbh_arc_min`, a diameter below RESOLVED distances
+    between returns at the mean distance of the views, or a standard deviation above `limits.dbh_sigma_max`.
 
     For a diameter D of n views at distances r, with a mean distance |h| from breast height:
 
@@ -229,4 +231,7 @@ def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tup
     edge = EDGE * max(BEAM * reach, 0.5 * spacing)
     views = 1.0 / (weight * reach * reach) + (edge + UNEVEN) ** 2
     stem = (limits.out_of_round * dbh) ** 2 + (limits.taper_sigma * above) ** 2
-    return dbh, np.sqrt(4.0 * views + stem)
+    sigma = np.sqrt(4.0 * views + stem)
+    if sigma > limits.dbh_sigma_max:
+        return np.nan, np.nan
+    return dbh, sigma

@@ -192,7 +192,9 @@ class Tracker:
         columns are copies. SHARED_COVARIANCE is added to the covariances. Diameters and eccentricities are
         NaN where they are unknown; heights and leans are None."""
         t, p = self.tracks, self.parameters
-        limits = FigureLimits(p.hits_to_confirm, np.radians(p.dbh_arc_min), p.out_of_round, p.taper_sigma)
+        limits = FigureLimits(
+            p.hits_to_confirm, np.radians(p.dbh_arc_min), p.dbh_sigma_max, p.out_of_round, p.taper_sigma
+        )
         coverage, dbh, dbh_sigma, eccentricity, confirmed = table_figures(t.as_rows(), limits)
         return Trees(
             number=t.number.copy(),

@@ -36,8 +36,13 @@ function overview(story, showCluster) {
     ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["λ1/λ2", figure(story.eccentricity)]];
   return el("div", { class: "story-fit" }, covered(story), el("div", {},
     definitions(rows),
-    story.dbh === null ? el("p", { class: "dim note", text: `The DBH needs ${figure(story.dbh_arc_deg)}° of the circumference.` }) : "",
+    story.dbh === null ? el("p", { class: "dim note", text: missingDbh(story) }) : "",
     story.cluster === null ? "" : el("button", { class: "small", text: `Its cluster in scan ${story.scan}`, onclick: () => showCluster(story.scan, story.cluster) })));
+}
+
+function missingDbh({ coverage_deg, dbh_arc_deg }) {
+  if (coverage_deg < dbh_arc_deg) return `The DBH needs ${figure(dbh_arc_deg)}° of the circumference.`;
+  return "Its views do not tell the DBH well enough (Maximum sigma of DBH): pass it closer.";
 }
 
 // The observed sides as arcs around the trunk; x of the map to the right.

@@ -22,8 +22,11 @@ BREAST = preset("forest").tracking.breast_height
 
 
 def tracker(spacing: float = 0.0, **changes: Any):
-    """With the parameters of the preset forest, but a diameter from any arc."""
-    return Tracker(preset("forest").tracking.model_copy(update={"dbh_arc_min": 0.0, **changes}), spacing)
+    """With the parameters of the preset forest, but a diameter from any arc and of any sigma."""
+    return Tracker(
+        preset("forest").tracking.model_copy(update={"dbh_arc_min": 0.0, "dbh_sigma_max": 0.5, **changes}),
+        spacing,
+    )
 
 
 def show(t, k, distance, radius, sigma, height=BREAST):
