@@ -205,6 +205,9 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
             label.set_placement(tuple(shape.centroid.coords[0]))
         for z, line in contours(run):
             space.add_lwpolyline(line.tolist(), dxfattribs={"layer": "CONTOURS", "elevation": z})
+        # Without this, ezdxf writes the classes of objects in the order of a set of strings.
+        for kind in sorted(drawing.entitydb.dxf_types_in_use()):
+            drawing.classes.add_class(kind)
         drawing.saveas(file)
     finally:
         ezdxf.options.write_fixed_meta_data_for_testing = before

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
 import sqlite3
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 import zipfile
@@ -132,6 +134,16 @@ def test_the_same_run_gives_the_same_bytes(runs, tmp_path, capsys, suffix):
     first = {file.name: file.read_bytes() for file in (tmp_path / "a").iterdir()}
     assert first == {file.name: file.read_bytes() for file in (tmp_path / "b").iterdir()}
     assert f"x.{suffix}" in first
+
+
+@pytest.mark.parametrize("hash_seed", ["0", "4"])  # two orders of the set of types of ezdxf
+def test_a_drawing_lists_its_types_in_one_order(runs, tmp_path, hash_seed):
+    program = "import sys; from app.cli import main; sys.exit(main(sys.argv[1:]))"
+    file = tmp_path / "trees.dxf"
+    words = [sys.executable, "-c", program, "export", runs["local"], "--to", file, *PLOTS]
+    subprocess.run(words, env={**os.environ, "PYTHONHASHSEED": hash_seed}, check=True, capture_output=True)
+    text = file.read_text(encoding="utf-8")
+    assert 0 < text.index("ACDBPLACEHOLDER") < text.index("AcDbLayout")
 
 
 def test_geojson_is_wgs84_with_a_georeference_and_else_local(runs, tmp_path, capsys):
