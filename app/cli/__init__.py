@@ -20,7 +20,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from app.common.text import version
-from app.extension import Extension, all_extensions, extensions_on, problems, switched_off
+from app.extension import VARIABLE, Extension, all_extensions, extensions_on, problems, switched_off
 from pipeline.errors import ParameterError, StemmapError, UsageError
 
 COMMANDS = (
@@ -264,6 +264,10 @@ def _takers(command: str) -> Iterator[ModuleType]:
 
 
 def _complain(error: object, code: int) -> int:
-    """Print an error to standard error and return the exit code."""
+    """Print an error to standard error and return the exit code. Unless the error names it, a second line
+    names the extensions that are switched off, whose formats and flags the program does not know."""
     print(f"stemmap: {error}", file=sys.stderr)
+    off = [each.name for each in all_extensions() if not each.is_on]
+    if off and VARIABLE not in str(error):
+        print(f"stemmap: {VARIABLE} switches off {', '.join(off)}", file=sys.stderr)
     return code

@@ -126,3 +126,16 @@ def test_formats_of_an_extension_that_fails_are_left_out(install, tmp_path, capl
     file.write_text("no scan")
     assert main(["info", str(file)]) == 1
     assert "the formats of the extension words are left out" in caplog.text
+
+
+@pytest.mark.parametrize("wanted", [None, "", "stand"])
+def test_a_refusal_names_the_extensions_that_are_switched_off(tmp_path, capsys, monkeypatch, wanted):
+    if wanted is not None:
+        monkeypatch.setenv(extension.VARIABLE, wanted)
+    (tmp_path / "run.laser").write_bytes(b"no recording")
+    assert main(["map", str(tmp_path / "run.laser"), "--out", str(tmp_path / "out")]) != 0
+    error = capsys.readouterr().err
+    off = [each.name for each in extension.all_extensions() if not each.is_on]
+    assert len(off) == {None: 0, "": 8, "stand": 7}[wanted]
+    assert (extension.VARIABLE in error) == bool(off)
+    assert all(name in error.splitlines()[-1] for name in off)
