@@ -7,7 +7,6 @@ The same run gives the same bytes: time stamps in the files are fixed.
 from __future__ import annotations
 
 import datetime
-import io
 import math
 import os
 import sqlite3
@@ -203,27 +202,27 @@ def export_run(run: R, file: FilePath, writers: Mapping[str, Writer[R]]) -> list
     return written
 
 
-def export_bytes(run: R, suffix: str, writers: Mapping[str, Writer[R]]) -> tuple[bytes, str]:
-    """Return the bytes of an exported file and its name, such as trees.gpkg. Several files are one
-    zip archive of the files of `export_run`, such as trees_shp.zip.
+def export_one_file(run: R, suffix: str, writers: Mapping[str, Writer[R]], folder: FilePath) -> FilePath:
+    """Export a run to one file in a folder and return it, such as trees.gpkg. Several files become one zip
+    archive of the files of `export_run`, such as trees_shp.zip.
 
     Args:
         run: The run.
         suffix: One of `writers`.
         writers: As for `export_run`.
+        folder: An empty folder.
 
     Raises:
         StemmapError, OSError: See `export_run`.
     """
-    with TemporaryDirectory(prefix="stemmap-export-") as folder:
-        written = export_run(run, FilePath(folder) / f"trees{suffix}", writers)
-        if len(written) == 1:
-            return written[0].read_bytes(), written[0].name
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-            for file in written:
-                archive.writestr(zipfile.ZipInfo(file.name, DATE.timetuple()[:6]), file.read_bytes())
-        return packed.getvalue(), f"trees_{suffix.lstrip('.')}.zip"
+    written = export_run(run, folder / f"trees{suffix}", writers)
+    if len(written) == 1:
+        return written[0]
+    packed = folder / f"trees_{suffix.lstrip('.')}.zip"
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in written:
+            archive.writestr(zipfile.ZipInfo(file.name, DATE.timetuple()[:6]), file.read_bytes())
+    return packed
 
 
 def layers_of(run: ExportedRun) -> dict[str, Any]:

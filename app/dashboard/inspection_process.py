@@ -130,18 +130,35 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def cloud(question: dict[str, Any]) -> dict[str, Any]:
-    """Write the cloud of a run to a file; return {}.
+    """Write the cloud of a run to cloud.laz; return {"file": its path}.
 
     Args:
-        question: The key "path" has the folder of the run, and "file" the .laz file.
+        question: The key "path" has the folder of the run, and "folder" that of the file.
 
     Raises:
         StemmapError: See `app.batch.mapped_cloud.write_cloud`.
     """
     from app.batch.mapped_cloud import write_cloud
 
-    write_cloud(Path(question["path"]), Path(question["file"]))
-    return {}
+    file = Path(question["folder"]) / "cloud.laz"
+    write_cloud(Path(question["path"]), file)
+    return {"file": str(file)}
+
+
+def export(question: dict[str, Any]) -> dict[str, Any]:
+    """Export a run to a file for geographic information systems; return {"file": its path}.
+
+    Args:
+        question: The key "path" has the folder of the run, "suffix" the suffix of a format of
+            `app.batch.export.WRITERS`, and "folder" the empty folder of the file.
+
+    Raises:
+        StemmapError, OSError: See `app.batch.export.export_run`.
+    """
+    from app.batch.export import WRITERS, export_one_file, read_for_export
+
+    run = read_for_export(Path(question["path"]))
+    return {"file": str(export_one_file(run, question["suffix"], WRITERS, Path(question["folder"])))}
 
 
 def alignment(question: dict[str, Any]) -> dict[str, Any]:
@@ -182,6 +199,7 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "inside": inside,
     "finished": finished,
     "cloud": cloud,
+    "export": export,
     "alignment": alignment,
 }
 

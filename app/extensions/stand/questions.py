@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import asdict
 from math import radians
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import StemmapError
 
-PLOTS_OF_FILE, GEOREFERENCE, REPORT, VISITS = (
-    f"{__name__}:{name}" for name in ("plots", "georeference", "report", "visits")
+if TYPE_CHECKING:
+    from app.extensions.stand.plots import SamplePlot
+
+PLOTS_OF_FILE, GEOREFERENCE, REPORT, VISITS, EXPORT = (
+    f"{__name__}:{name}" for name in ("plots", "georeference", "report", "visits", "export")
 )
 
 
@@ -76,26 +79,54 @@ def report(question: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         question: The key "path" has the folder of the run, "file" the .html or .pdf file, "language" the
-            language of the report, "plots" a list of [name, GeoJSON geometry] in the coordinates of the files
-            of the run, and "parameters" the values of `Stand`.
+            language of the report, and "plots" and "parameters" as in `export`.
 
     Raises:
         StemmapError, OSError: See `app.extensions.stand.report`.
     """
-    import shapely
-
     from app.extensions.stand.parameters import Stand
-    from app.extensions.stand.plots import SamplePlot
     from app.extensions.stand.report import report_page, write_report
 
     page = report_page(
         Path(question["path"]),
         language=question["language"],
-        plots=[SamplePlot(name, shapely.geometry.shape(shape)) for name, shape in question["plots"]],
+        plots=_plots_of(question),
         parameters=Stand.model_validate(question["parameters"]),
     )
     write_report(page, Path(question["file"]))
     return {}
+
+
+def export(question: dict[str, Any]) -> dict[str, Any]:
+    """Export a run with its plots to a file for GIS, CAD or spreadsheets; return {"file": its path}.
+
+    Args:
+        question: The key "path" has the folder of the run, "suffix" the suffix of a format of
+            `app.extensions.stand.gis_files.WRITERS`, "folder" the empty folder of the file, "plots" a list of
+            [name, GeoJSON geometry] in the coordinates of the files of the run, and "parameters" the values
+            of `Stand`.
+
+    Raises:
+        StemmapError, OSError: The file cannot be written, or all plots are outside of what was observed.
+    """
+    from app.batch.export import export_one_file
+    from app.extensions.stand.gis_files import WRITERS, read_with_plots
+    from app.extensions.stand.parameters import Stand
+    from app.extensions.stand.run_figures import stand_of
+
+    folder, plots = Path(question["path"]), _plots_of(question)
+    parameters = Stand.model_validate(question["parameters"])
+    run = read_with_plots(folder, stand_of(folder, parameters, plots) if plots else None)
+    return {"file": str(export_one_file(run, question["suffix"], WRITERS, Path(question["folder"])))}
+
+
+def _plots_of(question: dict[str, Any]) -> list[SamplePlot]:
+    """Return the plots of a question of `report` or `export`."""
+    import shapely
+
+    from app.extensions.stand.plots import SamplePlot
+
+    return [SamplePlot(name, shapely.geometry.shape(shape)) for name, shape in question["plots"]]
 
 
 def visits(question: dict[str, Any]) -> dict[str, Any]:

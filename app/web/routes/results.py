@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Iterator
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Path, Query
 from starlette.responses import FileResponse, Response
@@ -44,7 +44,7 @@ from pipeline.io.block_file import LARGE
 router = APIRouter(prefix="/api")
 
 # Reading a long recording again.
-_CLOUD_S = 600.0
+_EXPORT_S = 600.0
 _Scan = Annotated[int | None, Query(ge=0, le=LARGEST_NUMBER)]
 _Names = Annotated[str, Query(max_length=1000)]
 _Most = Annotated[int, Query(ge=2, le=MOST_ROWS)]
@@ -102,46 +102,44 @@ def path_table(dashboard: Dash) -> Response:
     return text_reply(csv_text(PATH_COLUMNS, rows), "path.csv")
 
 
-def _folder_for_large_files() -> Iterator[FilePath]:
+def folder_of_export() -> Iterator[FilePath]:
     """Yield a temporary folder, which is removed after the response is sent."""
-    with TemporaryDirectory(prefix="stemmap-cloud-", dir=LARGE) as name:
+    with TemporaryDirectory(prefix="stemmap-export-", dir=LARGE) as name:
         yield FilePath(name)
 
 
 @router.get("/export/laz")
-async def export_cloud(
-    dashboard: Dash, there: Annotated[FilePath, Depends(_folder_for_large_files)]
-) -> Response:
+async def export_cloud(dashboard: Dash, there: Annotated[FilePath, Depends(folder_of_export)]) -> Response:
     """Return the cloud of the run as LAZ, see `app.batch.mapped_cloud.write_cloud`; a child process reads the
     source again. Only for owners. 409 before the first map; 422 if the source cannot be read."""
-    run, file = ShownRun.of(dashboard), there / "cloud.laz"
-    with as_bad_request():
-        async with in_thread(run.folder()) as folder:
-            question = {"ask": "cloud", "path": str(folder), "file": str(file)}
-            await opening.ask(question, patience_s=_CLOUD_S)
-    return FileResponse(
-        file, 200, {"Cache-Control": "no-store"}, "application/octet-stream", filename=file.name
-    )
+    return await exported_file(ShownRun.of(dashboard), {"ask": "cloud"}, there)
 
 
 @router.get("/export/{suffix}", dependencies=[ViewerTurn])
-async def export(suffix: Literal["gpkg", "geojson"], dashboard: Dash) -> Response:
-    """Return the map as a file for geographic information systems, in the reference system of the map. For a
-    run of scans, the bytes are those of `stemmap export` for a run with the same map. 409 before the first
-    map; 422 if a package is missing."""
-    run = ShownRun.of(dashboard)
+async def export(
+    suffix: Literal["gpkg", "geojson"],
+    dashboard: Dash,
+    there: Annotated[FilePath, Depends(folder_of_export)],
+) -> Response:
+    """Return the map as a file for geographic information systems, in the reference system of the map; a
+    child process writes it. For a run of scans, the bytes are those of `stemmap export` for a run with the
+    same map. 409 before the first map; 422 if a package is missing."""
+    return await exported_file(ShownRun.of(dashboard), {"ask": "export", "suffix": f".{suffix}"}, there)
+
+
+async def exported_file(run: ShownRun, question: dict[str, Any], there: FilePath) -> Response:
+    """Return the file that a child process exports. Its answer has the path of the file as `file`; the
+    question is extended by the folder of the run, "path", and the empty folder of the file, "folder". 422 if
+    the child reports an error."""
     with as_bad_request():
-        content, name = await asyncio.to_thread(_exported, run, f".{suffix}")
-    return bytes_reply(content, filename=name)
-
-
-def _exported(run: ShownRun, suffix: str) -> tuple[bytes, str]:
-    """Return the bytes and the name of the exported file for a suffix with its dot, for example ".gpkg";
-    StemmapError where `export` answers 422."""
-    from app.batch.export import WRITERS, export_bytes, read_for_export
-
-    with run.folder() as folder:
-        return export_bytes(read_for_export(folder), suffix, WRITERS)
+        async with in_thread(run.folder()) as folder:
+            answer = await opening.ask(
+                {**question, "path": str(folder), "folder": str(there)}, patience_s=_EXPORT_S
+            )
+    file = FilePath(answer["file"])
+    return FileResponse(
+        file, 200, {"Cache-Control": "no-store"}, "application/octet-stream", filename=file.name
+    )
 
 
 @router.get("/evaluation")

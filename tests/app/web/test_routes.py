@@ -419,20 +419,26 @@ async def test_an_export_that_nobody_knows_is_refused(both: Running) -> None:
     assert (await client.get("/api/export/exe")).status_code == 422
 
 
-async def test_the_cloud_is_sent_from_a_file_that_is_removed(both: Running, monkeypatch, tmp_path) -> None:
+@pytest.mark.parametrize("suffix", ["laz", "gpkg", "geojson", "dxf"])
+async def test_a_child_writes_the_file_of_an_export_which_is_removed(
+    both: Running, monkeypatch, tmp_path, suffix
+) -> None:
     client, dashboard = both
-    assert (await client.get("/api/export/laz")).status_code == 409
+    assert (await client.get(f"/api/export/{suffix}")).status_code == 409
     await show(dashboard)
 
-    async def ask(question: dict[str, str], patience_s: float) -> None:
-        assert Path(question["file"]).is_relative_to(tmp_path)
-        Path(question["file"]).write_bytes(b"LASF")
+    async def ask(question: dict[str, str], patience_s: float) -> dict[str, str]:
+        file = Path(question["folder"]) / f"map.{suffix}"
+        assert file.is_relative_to(tmp_path)
+        assert Path(question["path"]).is_dir()
+        file.write_bytes(b"the file")
+        return {"file": str(file)}
 
     monkeypatch.setattr("app.web.routes.results.LARGE", tmp_path)
     monkeypatch.setattr("app.sources.opening.ask", ask)
-    reply = await client.get("/api/export/laz")
-    assert reply.content == b"LASF"
-    assert reply.headers["content-disposition"] == 'attachment; filename="cloud.laz"'
+    reply = await client.get(f"/api/export/{suffix}")
+    assert reply.content == b"the file"
+    assert reply.headers["content-disposition"] == f'attachment; filename="map.{suffix}"'
     assert list(tmp_path.iterdir()) == []
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Depends
 from shapely.geometry import mapping
 from starlette.responses import Response
 
@@ -17,11 +17,12 @@ from app.dashboard.shown_run import ShownRun
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plot_files import plots_of_run, stored_plots
 from app.extensions.stand.plots import SamplePlot
-from app.extensions.stand.questions import REPORT
+from app.extensions.stand.questions import EXPORT, REPORT
 from app.extensions.stand.routes.figure_parameters import FigureParameters
 from app.sources import opening
-from app.web.responses import as_bad_request, bytes_reply
+from app.web.responses import bytes_reply
 from app.web.routes.access import Dash, Deployment, ViewerTurn
+from app.web.routes.results import exported_file, folder_of_export
 from app.web.routes.runs import Key, is_open_run, run_folder
 
 router = APIRouter(prefix="/api")
@@ -30,36 +31,19 @@ router = APIRouter(prefix="/api")
 _REPORT_S = 240.0
 
 
-async def _export(suffix: str, dashboard: Dashboard, parameters: Stand) -> Response:
-    """Return the map with the plots of the run as a file, in the reference system of the map. For a run of
-    scans, the bytes are those of `stemmap export` for a run with the same map and plots. 409 before the first
-    map; 422 if a package is missing, the map lacks what the format shows, or all plots are outside of what
-    was observed."""
-    run = ShownRun.of(dashboard)
-    with as_bad_request():
-        content, name = await asyncio.to_thread(_exported, run, f".{suffix}", parameters)
-    return bytes_reply(content, filename=name)
-
-
-def _exported(run: ShownRun, suffix: str, parameters: Stand) -> tuple[bytes, str]:
-    """Return the bytes and the name of the exported file for a suffix with its dot, for example ".gpkg";
-    StemmapError where `_export` answers 422."""
-    from app.batch.export import export_bytes
-    from app.extensions.stand.gis_files import WRITERS, read_with_plots
-    from app.extensions.stand.run_figures import stand_of
-
-    plots = plots_of_run(run)
-    with run.folder() as folder:
-        of_plots = stand_of(folder, parameters, plots) if plots else None
-        return export_bytes(read_with_plots(folder, of_plots), suffix, WRITERS)
-
-
 def _add_export(suffix: str) -> None:
-    """Add the route of a format."""
+    """Add the route of a format, which returns the map with the plots of the run as a file, in the reference
+    system of the map. For a run of scans, the bytes are those of `stemmap export` for a run with the same map
+    and plots. 409 before the first map; 422 if a package is missing, the map lacks what the format shows, or
+    all plots are outside of what was observed."""
 
     @router.get(f"/export/{suffix}", dependencies=[ViewerTurn], name=f"export_{suffix}")
-    async def export(dashboard: Dash, parameters: FigureParameters) -> Response:
-        return await _export(suffix, dashboard, parameters)
+    async def export(
+        dashboard: Dash, parameters: FigureParameters, there: Annotated[FilePath, Depends(folder_of_export)]
+    ) -> Response:
+        run = ShownRun.of(dashboard)
+        question = {"ask": EXPORT, "suffix": f".{suffix}", **_of_plots(plots_of_run(run), parameters)}
+        return await exported_file(run, question, there)
 
 
 # The GeoPackage has plots, in place of that of the program.
@@ -88,11 +72,18 @@ async def report(
                 "path": str(folder),
                 "file": str(file),
                 "language": language,
-                "plots": [(plot.name, mapping(plot.shape)) for plot in plots],
-                "parameters": parameters.model_dump(),
+                **_of_plots(plots, parameters),
             }
             await opening.ask(question, patience_s=_REPORT_S)
             return bytes_reply(await asyncio.to_thread(file.read_bytes), filename=file.name)
+
+
+def _of_plots(plots: list[SamplePlot], parameters: Stand) -> dict[str, Any]:
+    """Return the keys "plots" and "parameters" of a question."""
+    return {
+        "plots": [(plot.name, mapping(plot.shape)) for plot in plots],
+        "parameters": parameters.model_dump(),
+    }
 
 
 async def _plots_of(key: str, folder: FilePath, dashboard: Dashboard) -> list[SamplePlot]:
