@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
+from pipeline.types.records import Int
 
 
 @compiled
@@ -33,6 +35,16 @@ def direction_bin(x: float, y: float, bins: int) -> int:
     origin counts as the direction +x.
     """
     return min(int(np.floor(direction_turn(x, y) * bins)), bins - 1)
+
+
+def direction_bins(place: Float, bins: int) -> Int:
+    """Return `direction_bin` of each vector (x, y), shape (N, 2), int64, shape (N,)."""
+    x, y = place.T
+    length = np.abs(x) + np.abs(y)
+    side = np.divide(y, length, out=np.zeros(len(place)), where=length > 0.0)
+    turn = np.where(x >= 0.0, 1.0 + side, np.where(y < 0.0, -1.0 - side, 3.0 - side))
+    sectors: Int = np.minimum(np.floor((turn + 1.0) * 0.25 * bins).astype(np.int64), bins - 1)
+    return sectors
 
 
 def bin_direction(k: int, bins: int) -> tuple[float, float]:

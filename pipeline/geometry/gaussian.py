@@ -6,6 +6,7 @@ matrices are slower.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -53,13 +54,9 @@ def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
     P[1, 2] = P[2, 1] = pose.yt
 
 
-@compiled
 def rows_of(covariance: Float) -> Float:
     """Return xx, xy, yy, shape (D, 3), of covariances of shape (D, 2, 2)."""
-    rows = np.empty((covariance.shape[0], 3))
-    for d in range(covariance.shape[0]):
-        rows[d, 0], rows[d, 1], rows[d, 2] = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
-    return rows
+    return np.ascontiguousarray(covariance.reshape(-1, 4)[:, [0, 1, 3]])
 
 
 @compiled_borrowing
@@ -95,7 +92,6 @@ def expected_spread(
     )
 
 
-@compiled
 def in_map(
     centre: Float, covariance: Float, pose: Float, pose_covariance: Float
 ) -> tuple[Float, Float, Float]:
@@ -108,38 +104,12 @@ def in_map(
         pose: x, y [m], yaw [rad] of the base in the map, shape (3,).
         pose_covariance: Covariance Sigma of the pose, shape (3, 3).
     """
-    D = centre.shape[0]
-    place, own, added = np.empty((D, 2)), np.empty((D, 2, 2)), np.empty((D, 2, 2))
-    _put_in_map(centre, covariance, pose, pose_covariance, place, own, added)
-    return place, own, added
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    C = np.array([[c, -s], [s, c]])
+    ahead = centre @ C.T
+    return ahead + pose[:2], C @ covariance @ C.T, _by_pose(ahead, pose_covariance)
 
 
-@compiled_borrowing
-def _put_in_map(
-    centre: Float, covariance: Float, pose: Float, Sigma: Float, place: Float, own: Float, added: Float
-) -> None:
-    """Write the results of `in_map`, in place.
-
-    Args:
-        centre, covariance: Detections in the base frame, shapes (D, 2) [m] and (D, 2, 2) [m^2].
-        pose, Sigma: Pose x, y, yaw, shape (3,), and its covariance, shape (3, 3).
-        place: Filled with the positions in the frame of the map, shape (D, 2) [m].
-        own: Filled with C R C^T, shape (D, 2, 2) [m^2].
-        added: Filled with J Sigma J^T, shape (D, 2, 2) [m^2].
-    """
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    for d in range(centre.shape[0]):
-        x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
-        place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
-        a, b, e = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
-        own[d, 0, 0] = c * c * a - 2.0 * c * s * b + s * s * e
-        own[d, 0, 1] = own[d, 1, 0] = c * s * (a - e) + (c * c - s * s) * b
-        own[d, 1, 1] = s * s * a + 2.0 * c * s * b + c * c * e
-        added[d, 0, 0], added[d, 0, 1], added[d, 1, 1] = by_pose(x, y, Sigma)
-        added[d, 1, 0] = added[d, 0, 1]
-
-
-@compiled
 def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
     """Return the covariance that a pose adds to positions relative to it, J Sigma J^T, shape (N, 2, 2) [m^2].
 
@@ -148,22 +118,17 @@ def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
         pose: Pose x, y [m], yaw [rad] in the map, shape (3,); J is evaluated at the position minus the pose.
         Sigma: Covariance of the pose, shape (3, 3).
     """
-    added = np.empty((position.shape[0], 2, 2))
-    for k in range(position.shape[0]):
-        xx, xy, yy = by_pose(position[k, 0] - pose[0], position[k, 1] - pose[1], Sigma)
-        added[k, 0, 0], added[k, 0, 1], added[k, 1, 0], added[k, 1, 1] = xx, xy, xy, yy
+    return _by_pose(position - pose[:2], Sigma)
+
+
+def _by_pose(ahead: Float, Sigma: Float) -> Float:
+    """Return J Sigma J^T, shape (N, 2, 2) [m^2], for positions relative to the pose along the axes of the
+    map, shape (N, 2) [m]: J = [[1, 0, -y], [0, 1, x]]."""
+    J = np.zeros((len(ahead), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = -ahead[:, 1], ahead[:, 0]
+    added: Float = J @ Sigma @ J.transpose(0, 2, 1)
     return added
-
-
-@compiled_borrowing
-def by_pose(x: float, y: float, Sigma: Float) -> tuple[float, float, float]:
-    """Return xx, xy, yy of J Sigma J^T [m^2], the covariance that a pose with the covariance Sigma, shape (3,
-    3), adds to a position x, y [m] from it along the axes of the map: J = [[1, 0, -y], [0, 1, x]]."""
-    return (
-        Sigma[0, 0] - 2.0 * y * Sigma[0, 2] + y * y * Sigma[2, 2],
-        Sigma[0, 1] + x * Sigma[0, 2] - y * Sigma[1, 2] - x * y * Sigma[2, 2],
-        Sigma[1, 1] + 2.0 * x * Sigma[1, 2] + x * x * Sigma[2, 2],
-    )
 
 
 @compiled_borrowing

@@ -16,7 +16,7 @@ from operator import attrgetter
 import numpy as np
 
 from pipeline.config.stages import Slam
-from pipeline.geometry.gaussian import pose_of, rows_of
+from pipeline.geometry.gaussian import rows_of
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam import slip_detection
@@ -560,11 +560,12 @@ class FastSlam:
         distance = state.distance
         places = state.places.with_scan(distance, state.detections - len(centre), births)
         if len(centre) and places.is_old(distance).any():
-            x, y, yaw = state.pose[state.best].tolist()
+            x, y, _ = state.pose[state.best].tolist()
             mean, covariance, hits, birth = known_near(state.maps, state.best, x, y, reach)
             rows = (hits >= self.parameters.hits_to_weigh) & places.of_old(birth, distance)
-            pose = pose_of(np.array([x, y, yaw]), estimate.local_covariance)
-            odds, agrees, near = agreement(pose, centre, R, mean[rows], covariance[rows])
+            odds, agrees, near = agreement(
+                state.pose[state.best], estimate.local_covariance, centre, R, mean[rows], covariance[rows]
+            )
             if odds > ODDS:
                 places = places.with_seen(distance, birth[rows][agrees])
             elif odds < -ODDS:

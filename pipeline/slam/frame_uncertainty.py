@@ -11,13 +11,13 @@ place of the covariance, and is added to the spread. Landmarks that are begun la
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled
 from pipeline.slam.motion import wrapped
 from pipeline.types.records import Bool, Int, Int32
 
@@ -88,11 +88,21 @@ class FrameUncertainty:
         Raises:
             LinAlgError: `spread` is not positive semidefinite.
         """
-        covariance, hidden = _with_frame(
-            pose, spread, n_eff, mean, birth, hits, hits_min, reach, self.serial, self.pose, self.covariance,
-            self.smoothed, self.hidden, self.at,
-        )  # fmt: skip
-        return covariance, replace(self, hidden=hidden, at=pose)
+        away = mean - pose[:2]
+        near = (hits >= hits_min) & ((away * away).sum(axis=1) <= reach * reach)
+        m = np.searchsorted(self.serial, birth[near], side="right") - 1
+        used, counts = np.unique(m[m >= 0], return_counts=True)
+        if not len(used):
+            hidden = transported_covariance(self.hidden, pose[0] - self.at[0], pose[1] - self.at[1])
+            return spread + hidden, replace(self, hidden=hidden, at=pose)
+        A = np.tile(np.eye(3), (len(used), 1, 1))
+        A[:, 0, 2], A[:, 1, 2] = self.pose[used, 1] - pose[1], pose[0] - self.pose[used, 0]
+        parts = A @ self.covariance[used] @ A.transpose(0, 2, 1)
+        weight, smoothed = counts / counts.sum(), self.smoothed[used]
+        least = np.tensordot(weight[~smoothed], parts[~smoothed], 1) + weight[smoothed].sum() * spread
+        of_map = np.tensordot(weight[smoothed], parts[smoothed], 1)
+        covariance = at_least(spread, least, NOISE / math.sqrt(n_eff)) + of_map
+        return covariance, replace(self, hidden=covariance - spread, at=pose)
 
     def observes_known(
         self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
@@ -122,7 +132,7 @@ class FrameUncertainty:
         Raises:
             LinAlgError: `spread` is not positive semidefinite.
         """
-        covariance = at_least(spread, np.ascontiguousarray(least), NOISE / np.sqrt(n_eff))
+        covariance = at_least(spread, least, NOISE / np.sqrt(n_eff))
         if by_landmarks is not None and np.trace(by_landmarks[:2, :2]) < np.trace(covariance[:2, :2]):
             covariance = by_landmarks
         return covariance, replace(self, hidden=covariance - spread)
@@ -229,10 +239,9 @@ class FrameUncertainty:
         Raises:
             LinAlgError: `spread` is not positive semidefinite.
         """
-        return replace(self, hidden=at_least(spread, np.ascontiguousarray(total)) - spread, at=at)
+        return replace(self, hidden=at_least(spread, total) - spread, at=at)
 
 
-@compiled
 def transported_covariance(covariance: Float, dx: float, dy: float) -> Float:
     """Return the covariance of a frame error at another pose: A Sigma A^T, A = [[1, 0, -dy], [0, 1, dx], [0,
     0, 1]].
@@ -244,64 +253,11 @@ def transported_covariance(covariance: Float, dx: float, dy: float) -> Float:
     Returns:
         Covariance of x, y [m], yaw [rad] at the second pose, shape (3, 3).
     """
-    C, moved = covariance, np.empty((3, 3))
-    t = C[2, 2]
-    moved[0, 0] = C[0, 0] - 2.0 * dy * C[0, 2] + dy * dy * t
-    moved[0, 1] = moved[1, 0] = C[0, 1] + dx * C[0, 2] - dy * C[1, 2] - dx * dy * t
-    moved[1, 1] = C[1, 1] + 2.0 * dx * C[1, 2] + dx * dx * t
-    moved[0, 2] = moved[2, 0] = C[0, 2] - dy * t
-    moved[1, 2] = moved[2, 1] = C[1, 2] + dx * t
-    moved[2, 2] = t
+    A = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    moved: Float = A @ covariance @ A.T
     return moved
 
 
-@compiled
-def _with_frame(
-    pose: Float,
-    spread: Float,
-    n_eff: float,
-    mean: Float,
-    birth: Int,
-    hits: Int32,
-    hits_min: int,
-    reach: float,
-    serial: Int,
-    place: Float,
-    covariance: Float,
-    smoothed: Bool,
-    hidden: Float,
-    at: Float,
-) -> tuple[Float, Float]:
-    """Return the covariance and the new `hidden`, both of shape (3, 3); see `FrameUncertainty.with_pose`.
-    `place` contains the reference poses, shape (M, 3); the other arguments are those of `with_pose` or
-    attributes."""
-    least, of_map, known = np.zeros((3, 3)), np.zeros((3, 3)), 0
-    counts = np.zeros(len(serial), np.int64)
-    for j in range(len(hits)):
-        dx, dy = mean[j, 0] - pose[0], mean[j, 1] - pose[1]
-        if hits[j] < hits_min or dx * dx + dy * dy > reach * reach:
-            continue
-        m = np.searchsorted(serial, birth[j], side="right") - 1
-        if m >= 0:
-            counts[m] += 1
-            known += 1
-    if known == 0:
-        hidden = transported_covariance(hidden, pose[0] - at[0], pose[1] - at[1])
-        return spread + hidden, hidden
-    for m in range(len(serial)):
-        if counts[m]:
-            weight = counts[m] / known
-            part = transported_covariance(covariance[m], pose[0] - place[m, 0], pose[1] - place[m, 1])
-            if smoothed[m]:
-                least += weight * spread
-                of_map += weight * part
-            else:
-                least += weight * part
-    both = at_least(spread, least, NOISE / np.sqrt(n_eff)) + of_map
-    return both, both - spread
-
-
-@compiled
 def at_least(spread: Float, least: Float, noise: float = 0.0) -> Float:
     """Return `spread`, shape (3, 3), enlarged to the variance of `least` in each common principal axis in
     which that of `least` is larger.

@@ -18,7 +18,7 @@ import numpy as np
 
 from pipeline.geometry.gaussian import Pose, corrected, expected_spread, rotated
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing
+from pipeline.jit import compiled_borrowing
 from pipeline.types.records import Bool, Int, Int32
 
 MOST = 8  # maximum number of detections
@@ -55,7 +55,6 @@ class JointSearch(NamedTuple):
     best: Int
 
 
-@compiled
 def search_for() -> JointSearch:
     """Return uninitialised work arrays for a search."""
     return JointSearch(

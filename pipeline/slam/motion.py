@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.config.stages import Slam
-from pipeline.geometry.poses import Float, Pose2
+from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.jit import compiled
 from pipeline.types.records import PoseMeasurement
 
 
-@compiled
 def wrapped(angle: float) -> float:
     """Return an angle [rad] wrapped to [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
@@ -39,7 +38,6 @@ def noise_of(p: Slam) -> Noise:
     return Noise(p.noise_distance, math.radians(p.noise_turn_distance), math.radians(p.noise_turn))
 
 
-@compiled
 def step_variances(x: float, y: float, yaw: float, noise: Noise) -> tuple[float, float]:
     """Return the variances of one odometry step, in the frame in which the step begins.
 
@@ -54,7 +52,7 @@ def step_variances(x: float, y: float, yaw: float, noise: Noise) -> tuple[float,
     Returns:
         Variance of x and of y [m^2], and variance of yaw [rad^2].
     """
-    distance = np.hypot(x, y)
+    distance = math.hypot(x, y)
     heading = noise.turn_distance**2 * distance + noise.turn**2 * abs(yaw)
     return noise.distance**2 * distance, heading
 
@@ -77,7 +75,6 @@ class OdometryTrust(NamedTuple):
     known_share: float
 
 
-@compiled
 def drift_variances(motion: Float, driven: float, trust: OdometryTrust) -> tuple[float, float]:
     """Return the variances of the predicted pose relative to the surrounding trees, for an odometry without
     faults.
@@ -89,13 +86,14 @@ def drift_variances(motion: Float, driven: float, trust: OdometryTrust) -> tuple
     Args:
         motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
         driven: Path length since that scan, plus TURN_AS_DISTANCE per radian [m]. It is ignored while the
-            odometry is distrusted, because each step then has a larger covariance (see `advanced`).
+            odometry is distrusted, because each step then has a larger covariance (see `accumulated`).
         trust: State of the odometry.
 
     Returns:
         Variance of x and of y [m^2], and variance of yaw [rad^2].
     """
-    distance, turned = np.hypot(motion[0], motion[1]), abs(motion[2])
+    x, y, yaw = motion.tolist()
+    distance, turned = math.hypot(x, y), abs(yaw)
     trusted = trust.distrust == 0.0
     detour = max(driven - distance - TURN_AS_DISTANCE * turned, 0.0) if trusted else 0.0
     detour += trust.unobserved  # the share of turns in this distance is unknown
@@ -119,7 +117,6 @@ def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -
     return compounded(motion, covariance, step.x, step.y, step.yaw, step_noise)
 
 
-@compiled
 def compounded(
     motion: Float, covariance: Float, x: float, y: float, yaw: float, noise: Float
 ) -> tuple[Float, Float]:
@@ -129,18 +126,12 @@ def compounded(
     F is the Jacobian by the motion and G the rotation of the step into the frame of the motion; P is
     `covariance` and Q is `noise`, both of shape (3, 3). See `compound`.
     """
-    c, s = np.cos(motion[2]), np.sin(motion[2])
+    c, s = math.cos(motion[2]), math.sin(motion[2])
     dx, dy = c * x - s * y, s * x + c * y
     moved = np.array([motion[0] + dx, motion[1] + dy, wrapped(motion[2] + yaw)])
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     G = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    spread = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for a in range(3):
-                for b in range(3):
-                    spread[i, j] += F[i, a] * covariance[a, b] * F[j, b] + G[i, a] * noise[a, b] * G[j, b]
-    return moved, spread
+    return moved, F @ covariance @ F.T + G @ noise @ G.T
 
 
 class Motion(NamedTuple):
@@ -149,7 +140,7 @@ class Motion(NamedTuple):
     Attributes:
         step: T_base(t-1)_base(t) by the odometry.
         slack: Standard deviations that are added where the odometry is doubtful: position [m], heading [rad].
-            Those of successive steps are of one velocity, so they add up linearly; see `advanced`.
+            Those of successive steps are of one velocity, so they add up linearly; see `accumulated`.
         doubt: Message with the reason of the doubt; empty if there is none.
         measured: Pose that another source measured at this scan, if any.
         covariance: Covariance of the step, shape (3, 3), if its source knows it, as LiDAR odometry does;
@@ -202,15 +193,20 @@ def accumulated(
         and has none of these.
     """
     step = motion.step
-    news = motion.measured is not None
     own = np.array(motion.slack) + distrust * motion.period * np.array(DISTRUST)
     if motion.turn_sigma is not None:
         own[1] = motion.slack[1]  # slipping wheels do not affect a gyroscope
-    moved, motion_after, spread, slack_after, driven = advanced(
-        before, covariance, slack, step.x, step.y, step.yaw, own, step_covariance(motion, noise_of(p)),
-        news, p.update_distance,
-    )  # fmt: skip
-    return (motion_after, spread, slack_after, driven) if moved else None
+    news = motion.measured is not None or bool(own.any())
+    if step.x == 0.0 and step.y == 0.0 and step.yaw == 0.0 and not news:
+        return None
+    # A slack is the error of an unknown velocity, which is the same in successive steps: standard deviations
+    # add up, and the variance grows with the square of the time, however many scans there are.
+    total = np.minimum(slack + own, SLACK_MAX)
+    noise = step_covariance(motion, noise_of(p))
+    noise[[0, 1, 2], [0, 1, 2]] += (total * total - slack * slack)[[0, 0, 1]]
+    moved, spread = compounded(before, covariance, step.x, step.y, step.yaw, noise)
+    driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
+    return moved, spread, total, max(driven, p.update_distance) if news else driven
 
 
 def step_covariance(motion: Motion, noise: Noise) -> Float:
@@ -225,50 +221,6 @@ def step_covariance(motion: Motion, noise: Noise) -> Float:
         covariance[2, :] = covariance[:, 2] = 0.0
         covariance[2, 2] = motion.turn_sigma**2
     return covariance
-
-
-@compiled
-def advanced(
-    before: Float,
-    covariance: Float,
-    slack: Float,
-    x: float,
-    y: float,
-    yaw: float,
-    own: Float,
-    noise: Float,
-    news: bool,
-    update_distance: float,
-) -> tuple[bool, Float, Float, Float, float]:
-    """Return the same as `accumulated` in compiled code, with a flag in place of None.
-
-    A slack is the error of an unknown velocity, which is the same in successive steps: standard deviations
-    add up, up to SLACK_MAX, and the variance grows with the square of the time, however many scans there are.
-
-    Args:
-        before, covariance, slack: See `accumulated`.
-        x, y, yaw: Step [m, m, rad].
-        own: Slack of the step itself [m, rad], shape (2,).
-        noise: Covariance of the step without slack, shape (3, 3).
-        news: Whether another source measured the pose.
-        update_distance: Distance after which a scan is used [m]; a doubtful step or a measured pose counts at
-            least this much, so that its scan is used.
-
-    Returns:
-        Whether there is anything to add; motion, shape (3,); covariance, shape (3, 3); sum of the slack,
-        shape (2,); and the distance [m]. If there is nothing, copies of the arguments and 0.
-    """
-    news = news or own[0] != 0.0 or own[1] != 0.0
-    if x == 0.0 and y == 0.0 and yaw == 0.0 and not news:
-        return False, before.copy(), covariance.copy(), slack.copy(), 0.0
-    total = np.array([min(slack[0] + own[0], SLACK_MAX[0]), min(slack[1] + own[1], SLACK_MAX[1])])
-    spread = noise.copy()
-    for i in range(3):
-        k = i // 2
-        spread[i, i] += total[k] * total[k] - slack[k] * slack[k]
-    moved, spread = compounded(before, covariance, x, y, yaw, spread)
-    driven = np.hypot(x, y) + TURN_AS_DISTANCE * abs(wrapped(yaw))
-    return True, moved, spread, total, max(driven, update_distance) if news else driven
 
 
 @compiled
@@ -324,7 +276,6 @@ def inverted(S: Float) -> tuple[Float, float]:
     return inverse, det
 
 
-@compiled
 def moved_poses(pose: Float, motion: Float) -> Float:
     """Return poses after one common motion, T_map_after = T_map_pose T_motion for each row, shape (P, 3),
     with yaw in [-pi, pi).
@@ -333,27 +284,22 @@ def moved_poses(pose: Float, motion: Float) -> Float:
         pose: x, y [m], yaw [rad] of each pose, shape (P, 3).
         motion: x, y [m], yaw [rad] in the frame of each pose, shape (3,).
     """
-    moved = np.empty_like(pose)
-    for p in range(pose.shape[0]):
-        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
-        moved[p, 0] = pose[p, 0] + c * motion[0] - s * motion[1]
-        moved[p, 1] = pose[p, 1] + s * motion[0] + c * motion[1]
-        moved[p, 2] = (pose[p, 2] + motion[2] + np.pi) % (2.0 * np.pi) - np.pi
-    return moved
+    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    x, y, yaw = motion.tolist()
+    return np.column_stack(
+        [pose[:, 0] + c * x - s * y, pose[:, 1] + s * x + c * y, wrap_angle(pose[:, 2] + yaw)]
+    )
 
 
-@compiled
 def moved_pose(pose: Float, motion: Float) -> Float:
     """Return one pose x, y [m], yaw [rad], shape (3,), after a motion in its own frame, shape (3,), with yaw
     in [-pi, pi). The arguments are unchanged."""
-    one = np.empty((1, 3))
-    for i in range(3):
-        one[0, i] = pose[i]
-    moved: Float = moved_poses(one, motion)[0]
-    return moved
+    x, y, yaw = pose.tolist()
+    dx, dy, turn = motion.tolist()
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([x + c * dx - s * dy, y + s * dx + c * dy, wrapped(yaw + turn)])
 
 
-@compiled
 def weighted_pose(
     pose: Float, weights: Float, motion: Float, motion_covariance: Float
 ) -> tuple[Float, Float]:
@@ -370,30 +316,11 @@ def weighted_pose(
         motion: Motion since the poses were sampled, the same for all, shape (3,).
         motion_covariance: Covariance of `motion` in the frame in which it begins, shape (3, 3).
     """
-    mean = np.zeros(3)
-    cos, sin = 0.0, 0.0
-    for p in range(pose.shape[0]):
-        mean[0] += weights[p] * pose[p, 0]
-        mean[1] += weights[p] * pose[p, 1]
-        cos += weights[p] * np.cos(pose[p, 2])
-        sin += weights[p] * np.sin(pose[p, 2])
-    mean[2] = np.arctan2(sin, cos)
-    covariance = np.zeros((3, 3))
-    for p in range(pose.shape[0]):
-        dx, dy = pose[p, 0] - mean[0], pose[p, 1] - mean[1]
-        turn = (pose[p, 2] - mean[2] + np.pi) % (2.0 * np.pi) - np.pi
-        covariance[0, 0] += weights[p] * dx * dx
-        covariance[0, 1] += weights[p] * dx * dy
-        covariance[0, 2] += weights[p] * dx * turn
-        covariance[1, 1] += weights[p] * dy * dy
-        covariance[1, 2] += weights[p] * dy * turn
-        covariance[2, 2] += weights[p] * turn * turn
-    c, s = np.cos(mean[2] - motion[2]), np.sin(mean[2] - motion[2])
+    yaw = math.atan2(float(weights @ np.sin(pose[:, 2])), float(weights @ np.cos(pose[:, 2])))
+    mean = np.append(weights @ pose[:, :2], yaw)
+    away = pose - mean
+    away[:, 2] = wrap_angle(away[:, 2])
+    c, s = math.cos(yaw - motion[2]), math.sin(yaw - motion[2])
     C = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    for i in range(3):
-        for j in range(i, 3):
-            for a in range(3):
-                for b in range(3):
-                    covariance[i, j] += C[i, a] * motion_covariance[a, b] * C[j, b]
-            covariance[j, i] = covariance[i, j]
-    return mean, covariance
+    covariance = (away * weights[:, None]).T @ away + C @ motion_covariance @ C.T
+    return mean, 0.5 * (covariance + covariance.T)

@@ -19,7 +19,6 @@ import numpy as np
 from pipeline.geometry.columns import GrowingColumns
 from pipeline.geometry.pose_arrays import composed, inverse
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int, Path
 
 WORD = 2**32  # seeds below it need one 32-bit word
@@ -40,21 +39,14 @@ def draws(seed: int, index: int, particles: int) -> tuple[Float, float]:
     return rng.standard_normal((particles, 3)), float(rng.random())
 
 
-@compiled
 def normalised(log_weight: Float) -> Float:
     """Return weights that sum to 1 from logarithms up to a constant, shape (P,), P > 0. NaN if all logarithms
     are -inf; the argument is unchanged."""
-    weights = np.empty(log_weight.shape[0])
-    greatest, total = log_weight.max(), 0.0
-    for p in range(log_weight.shape[0]):
-        weights[p] = np.exp(log_weight[p] - greatest)
-        total += weights[p]
-    for p in range(log_weight.shape[0]):
-        weights[p] /= total
-    return weights
+    weights = np.exp(log_weight - log_weight.max())
+    normed: Float = weights / weights.sum()
+    return normed
 
 
-@compiled
 def low_variance_ancestors(weights: Float, offset: float) -> Int:
     """Return the row of the ancestor of each particle of the new generation, int64, shape (P,).
 
@@ -65,31 +57,14 @@ def low_variance_ancestors(weights: Float, offset: float) -> Int:
         weights: Weights with sum 1, shape (P,).
         offset: Uniform random number in [0, 1).
     """
-    n = weights.shape[0]
-    draws = np.zeros(n, np.int64)
-    total, k = weights[0], 0
-    for i in range(n):
-        at = (i + offset) / n
-        while at >= total and k < n - 1:
-            k += 1
-            total += weights[k]
-        draws[k] += 1
-    ancestors = np.full(n, -1, np.int64)
-    for k in range(n):
-        if draws[k] > 0:
-            ancestors[k] = k
-            draws[k] -= 1
-    k = 0
-    for i in range(n):
-        if ancestors[i] < 0:
-            while draws[k] == 0:
-                k += 1
-            ancestors[i] = k
-            draws[k] -= 1
+    n = len(weights)
+    rows = np.searchsorted(np.cumsum(weights), (np.arange(n) + offset) / n, side="right")
+    draws = np.bincount(np.minimum(rows, n - 1), minlength=n)
+    ancestors = np.where(draws > 0, np.arange(n), -1)
+    ancestors[draws == 0] = np.repeat(np.arange(n), np.maximum(draws - 1, 0))
     return ancestors
 
 
-@compiled
 def are_apart(pose: Float, weights: Float, distance: float) -> bool:
     """Return whether the weighted position scatter of particles exceeds a distance per axis.
 
@@ -100,16 +75,10 @@ def are_apart(pose: Float, weights: Float, distance: float) -> bool:
         weights: Weights with sum 1, shape (P,).
         distance: Standard deviation per axis [m].
     """
-    x, y, square = 0.0, 0.0, 0.0
-    for p in range(pose.shape[0]):
-        x += weights[p] * pose[p, 0]
-        y += weights[p] * pose[p, 1]
-    for p in range(pose.shape[0]):
-        square += weights[p] * ((pose[p, 0] - x) ** 2 + (pose[p, 1] - y) ** 2)
-    return square > 2.0 * distance * distance
+    away = pose[:, :2] - weights @ pose[:, :2]
+    return bool(weights @ (away * away).sum(axis=1) > 2.0 * distance * distance)
 
 
-@compiled
 def select_best(weights: Float, before: int, pose: Float, distance: float) -> int:
     """Return the row of the best particle: the heaviest one (the first of equal ones), or the previous one if
     the particles are apart.
@@ -126,7 +95,6 @@ def select_best(weights: Float, before: int, pose: Float, distance: float) -> in
     return before if are_apart(pose, weights, distance) else int(np.argmax(weights))
 
 
-@compiled
 def best_after_resampling(best: int, ancestors: Int, weights: Float) -> int:
     """Return the row of the best particle after resampling: `best` if it survived, else the heaviest
     particle.

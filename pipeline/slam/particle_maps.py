@@ -8,13 +8,14 @@ blocks out of reach without a test of their landmarks.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.geometry.hash_grid import Cells, holds_unseen
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing
+from pipeline.jit import compiled_borrowing
 from pipeline.types.records import Bool, Float32, Int, Int32
 
 ROOM = 16  # landmarks per block; landmarks with successive births are near each other
@@ -111,47 +112,26 @@ def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
     )
 
 
-@compiled
 def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
     """Return the maps with space for a number of further landmarks per particle and at least a number of free
     rows in the pool. The result shares arrays with `maps` where there was enough space; `places` is always
     shared."""
     particles, k = maps.block.shape
-    places = landmarks
-    for p in range(particles):
-        places = max(places, maps.places[p] + landmarks)
-    block = maps.block
+    places = int(maps.places.max(initial=0)) + landmarks
     if places > k * ROOM:
-        block = np.full((particles, max((places + ROOM - 1) // ROOM, 2 * k)), -1, np.int32)
-        for p in range(particles):
-            for i in range(k):
-                block[p, i] = maps.block[p, i]
-    n, free = len(maps.owners), maps.free_count[0]
+        block = np.full((particles, max(-(-places // ROOM), 2 * k)), -1, np.int32)
+        block[:, :k] = maps.block
+        maps = maps._replace(block=block)
+    n, free = len(maps.owners), int(maps.free_count[0])
     if rows <= free:
-        return _with_block(maps, block)
+        return maps
     more = max(rows - free, n // 2)
-    grown = Maps(
-        block,
-        maps.places,
-        np.zeros((n + more, ROOM, 2)),
-        np.zeros((n + more, ROOM, 3)),
-        np.zeros((n + more, ROOM), np.int32),
-        np.zeros((n + more, ROOM), np.float32),
-        np.zeros((n + more, ROOM), np.int64),
-        np.empty((n + more, 4)),
-        np.zeros(n + more, np.int32),
-        np.zeros(n + more, np.int32),
-        np.array([free + more]),
-    )
-    for b in range(n):
-        _copy_row(maps, b, grown, b)
-        grown.owners[b] = maps.owners[b]
-    for b in range(n, n + more):
-        grown.box[b, 0] = grown.box[b, 1] = np.inf
-        grown.box[b, 2] = grown.box[b, 3] = -np.inf
-        grown.free[free + b - n] = b
-    for i in range(free):
-        grown.free[i] = maps.free[i]
+    grown = _with_pool(maps.block, maps.places, n + more)
+    for name in (*MapColumns._fields, "box", "owners"):
+        getattr(grown, name)[:n] = getattr(maps, name)
+    grown.free[:free] = maps.free[:free]
+    grown.free[free : free + more] = np.arange(n, n + more)
+    grown.free_count[0] = free + more
     return grown
 
 
@@ -167,15 +147,6 @@ def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
         other.birth[n, o] = maps.birth[b, o]
     for a in range(4):
         other.box[n, a] = maps.box[b, a]
-
-
-@compiled
-def _with_block(maps: Maps, block: Int32) -> Maps:
-    """Return the maps with another array of blocks. Both share all other arrays."""
-    return Maps(
-        block, maps.places, maps.mean, maps.covariance, maps.hits, maps.score, maps.birth, maps.box,
-        maps.owners, maps.free, maps.free_count,
-    )  # fmt: skip
 
 
 def taken(maps: Maps, rows: Int) -> Maps:
@@ -224,53 +195,35 @@ def is_sound(maps: Maps, particles: int) -> bool:
     )
 
 
-@compiled
-def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
-    """Return copies of the landmarks of particle p: the columns of `MapColumns`. Unused places (hits 0) are
-    skipped; the order is that of the places."""
-    places = maps.places[p]
-    mean, covariance = np.empty((places, 2)), np.empty((places, 3))
-    hits, score = np.empty(places, np.int32), np.empty(places, np.float32)
-    birth = np.empty(places, np.int64)
-    n = 0
-    for i in range(places):
-        b, o = maps.block[p, i // ROOM], i % ROOM
-        if maps.hits[b, o] > 0:
-            mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
-            for a in range(3):
-                covariance[n, a] = maps.covariance[b, o, a]
-            hits[n], score[n], birth[n] = maps.hits[b, o], maps.score[b, o], maps.birth[b, o]
-            n += 1
-    return mean[:n], covariance[:n], hits[:n], score[:n], birth[:n]
+def map_of(maps: Maps, p: int) -> MapColumns:
+    """Return copies of the landmarks of particle p. Unused places (hits 0) are skipped; the order is that of
+    the places."""
+    places = int(maps.places[p])
+    block = maps.block[p, : -(-places // ROOM)]
+    used = (maps.hits[block].ravel() > 0) & (np.arange(len(block) * ROOM) < places)
+    return MapColumns(*(_places_of(getattr(maps, name), block)[used] for name in MapColumns._fields))
 
 
-@compiled
+def _places_of(column: NDArray[Any], block: Int32) -> NDArray[Any]:
+    """Return a copy of the rows of all places of some blocks, shape (K ROOM, ...), of a column of Maps."""
+    rows = column[block]
+    return rows.reshape(len(block) * ROOM, *rows.shape[2:])
+
+
 def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32, Int]:
     """Return the landmarks of particle p within `reach` [m] of x, y [m]: positions, shape (L, 2) [m];
     covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, and birth numbers, int64, shape (L,). The
     distance must be smaller than `reach`; the arrays are copies, in the order of the places."""
-    places = maps.places[p]
-    mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
-    birth = np.empty(places, np.int64)
-    n = 0
-    for k in range((maps.places[p] + ROOM - 1) // ROOM):
-        b = maps.block[p, k]
-        dx = max(maps.box[b, 0] - x, 0.0, x - maps.box[b, 2])
-        dy = max(maps.box[b, 1] - y, 0.0, y - maps.box[b, 3])
-        if not dx * dx + dy * dy < reach * reach:
-            continue
-        for o in range(min(ROOM, maps.places[p] - k * ROOM)):
-            dx, dy = maps.mean[b, o, 0] - x, maps.mean[b, o, 1] - y
-            if maps.hits[b, o] > 0 and dx * dx + dy * dy < reach * reach:
-                mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
-                for a in range(3):
-                    covariance[n, a] = maps.covariance[b, o, a]
-                hits[n], birth[n] = maps.hits[b, o], maps.birth[b, o]
-                n += 1
-    return mean[:n], covariance[:n], hits[:n], birth[:n]
+    places = int(maps.places[p])
+    block = maps.block[p, : -(-places // ROOM)]
+    mean = _places_of(maps.mean, block)
+    away = mean - (x, y)
+    near = (away * away).sum(axis=1) < reach * reach
+    near &= (maps.hits[block].ravel() > 0) & (np.arange(len(mean)) < places)
+    covariance, hits = _places_of(maps.covariance, block)[near], _places_of(maps.hits, block)[near]
+    return mean[near], covariance, hits, _places_of(maps.birth, block)[near]
 
 
-@compiled
 def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[Int32, Int32, int]:
     """Return the blocks of each particle whose bounding box is at most `reach` from its pose.
 
@@ -285,9 +238,9 @@ def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[
         (P,); and the number of free rows of the pool that the update may need.
     """
     near = np.empty(maps.block.shape, np.int32)
-    length = np.empty(pose.shape[0], np.int32)
+    length = np.empty(len(pose), np.int32)
     shared = _fill_in_reach(maps, pose, reach, near, length)
-    return near, length, pose.shape[0] * (fresh // ROOM + 2) + shared
+    return near, length, len(pose) * (fresh // ROOM + 2) + shared
 
 
 @compiled_borrowing

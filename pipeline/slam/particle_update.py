@@ -3,6 +3,7 @@ estimate of the pose from all particles."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from pipeline.slam.particle_maps import (
     widen,
     with_room,
 )
-from pipeline.slam.places import ACTIVE, INACTIVE, PlaceStates, state_of
+from pipeline.slam.places import ACTIVE, INACTIVE, PlaceStates, state_of, states_of
 from pipeline.slam.pose_quality import MISSED, MOST_HITS, SHIFT, STATISTICS, mean_statistics
 from pipeline.slam.proposal import Room, recognise, room_for
 from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
@@ -92,7 +93,6 @@ class Near(NamedTuple):
     cells: Cells
 
 
-@compiled
 def near_for(landmarks: int) -> Near:
     """Return uninitialised work arrays for this number of landmarks; the hash grid is empty."""
     n = landmarks
@@ -492,7 +492,6 @@ def _shift(
     statistics[p, SHIFT_YAW] = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
 
 
-@compiled
 def against_slip(
     pose: Float,
     maps: Maps,
@@ -519,12 +518,12 @@ def against_slip(
         driven: Path length since the last used scan [m], see `drift_variances`.
         wheels: Trust in the odometry.
     """
-    if centre.shape[0] < FEWEST_PAIRS:
+    if len(centre) < FEWEST_PAIRS:
         return TreeMotion(False, motion.copy(), motion_covariance.copy(), False)
-    at = moved_pose(pose[best], motion)
-    known, spread, hits, birth = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
-    if places.state.shape[0]:
-        active = np.array([state_of(b, places) == ACTIVE for b in birth], np.bool_)
+    x, y, _ = moved_pose(pose[best], motion).tolist()
+    known, spread, hits, birth = known_near(maps, best, x, y, rules.view_range + SEARCH)
+    if len(places.state):
+        active = states_of(birth, places) == ACTIVE
         known, spread, hits = known[active], spread[active], hits[active]
     return motion_by_trees(
         pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,
@@ -532,7 +531,6 @@ def against_slip(
     )  # fmt: skip
 
 
-@compiled
 def use_scan(
     pose: Float,
     log_weight: Float,
@@ -557,18 +555,16 @@ def use_scan(
         normalised weights, shape (P,); both results of `mean_statistics`; and births of the associated or new
         landmarks, int64, shape (P, D).
     """
-    found = centre.shape[0]
-    reach = 0.0
-    for d in range(found):
-        reach = max(reach, centre[d, 0] * centre[d, 0] + centre[d, 1] * centre[d, 1])
-    reach = max(rules.view_range, np.sqrt(reach) + rules.distance_max) if found else rules.view_range
+    found = len(centre)
+    farthest = math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
+    reach = max(rules.view_range, farthest + rules.distance_max) if found else rules.view_range
     moved = predict(pose, motion, motion_covariance, noise, rules.use_proposal)
     blocks, lengths, rows = blocks_in_reach(maps, moved, reach, found)
     maps = with_room(maps, found, rows)
-    landmarks = lengths.max() * ROOM + found
+    landmarks = int(lengths.max()) * ROOM + found
     near, room = near_for(landmarks), room_for(found, landmarks)
-    statistics = np.zeros((pose.shape[0], STATISTICS))
-    births = np.empty((pose.shape[0], found), np.int64)
+    statistics = np.zeros((len(pose), STATISTICS))
+    births = np.empty((len(pose), found), np.int64)
     observe(
         pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
         clear_range, reach, first_birth, places, rules, near, room, statistics, measured, births, np.empty(3),
@@ -580,7 +576,6 @@ def use_scan(
     return maps, weights, mean, odometry, births
 
 
-@compiled
 def estimated(
     pose: Float, weights: Float, motion: Float, motion_covariance: Float
 ) -> tuple[Float, Float, Float, float]:
@@ -589,4 +584,4 @@ def estimated(
     that `pose` contains the poses before the motion."""
     particles = moved_poses(pose, motion)
     mean, covariance = weighted_pose(particles, weights, motion, motion_covariance)
-    return particles, mean, covariance, 1.0 / (weights * weights).sum()
+    return particles, mean, covariance, float(1.0 / (weights @ weights))

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.geometry.gaussian import Pose, expected_spread
+from pipeline.geometry.gaussian import in_map
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing
+from pipeline.jit import compiled_borrowing
 from pipeline.types.records import Bool, Int
 
 #: m of path without a view of a place, after which a view of it is a revisit.
@@ -176,9 +176,14 @@ def state_of(birth: int, places: PlaceStates) -> int:
     return places.state[low - 1] if low > 0 else ACTIVE
 
 
-@compiled
+def states_of(birth: Int, places: PlaceStates) -> Int:
+    """Return `state_of` of several landmarks, int64, shape (L,), by birth numbers of shape (L,)."""
+    row = np.searchsorted(places.birth, birth, side="right") - 1
+    return np.where(row >= 0, places.state[row], ACTIVE) if len(places.state) else np.full(len(birth), ACTIVE)
+
+
 def agreement(
-    pose: Pose, centre: Float, R: Float, mean: Float, covariance: Float
+    pose: Float, pose_covariance: Float, centre: Float, R: Float, mean: Float, covariance: Float
 ) -> tuple[float, Bool, Bool]:
     """Return the log odds that detections show the given landmarks and not others, which landmarks agree with
     a detection, and which have a detection within WINDOW, shape (L,). The log odds are 0 if no landmark is
@@ -190,33 +195,25 @@ def agreement(
     within WINDOW.
 
     Args:
-        pose: Pose with its covariance relative to the active landmarks.
+        pose: x, y [m], yaw [rad], shape (3,).
+        pose_covariance: Covariance of the pose relative to the active landmarks, shape (3, 3).
         centre: Detections in the base frame, shape (D, 2) [m].
         R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         mean: Positions of the landmarks, shape (L, 2) [m].
         covariance: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2].
     """
-    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
-    n = mean.shape[0]
-    agrees, close = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    area = np.zeros(n)
-    for d in range(centre.shape[0]):
-        ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
-        s0, s1, s2 = expected_spread(pose, c, s, ax, ay, R, d)
-        for j in range(n):
-            y0, y1 = mean[j, 0] - pose.x - ax, mean[j, 1] - pose.y - ay
-            if y0 * y0 + y1 * y1 > WINDOW * WINDOW:
-                continue
-            S0, S1, S2 = s0 + covariance[j, 0], s1 + covariance[j, 1], s2 + covariance[j, 2]
-            det = S0 * S2 - S1 * S1
-            area[j] += np.pi * GATE * GATE * np.sqrt(det)
-            d2 = (S2 * y0 * y0 - 2.0 * S1 * y0 * y1 + S0 * y1 * y1) / det
-            close[j] = True
-            agrees[j] |= d2 < GATE * GATE
-    odds = 0.0
-    for j in range(n):
-        if close[j]:
-            p = 1.0 - np.exp(-area[j] / (np.pi * WINDOW * WINDOW))
-            q = max(p, AGREEING)
-            odds += np.log(q / p) if agrees[j] else np.log((1.0 - q) / (1.0 - p)) if p < q else 0.0
-    return odds, agrees, close
+    place, own, added = in_map(centre, R[:, [0, 1, 1, 2]].reshape(-1, 2, 2), pose, pose_covariance)
+    expected = (own + added).reshape(-1, 1, 4)[:, :, [0, 1, 3]]  # of each detection
+    y0, y1 = np.moveaxis(mean - place[:, None], 2, 0)
+    S0, S1, S2 = np.moveaxis(expected + covariance, 2, 0)
+    near = y0 * y0 + y1 * y1 <= WINDOW * WINDOW
+    det = S0 * S2 - S1 * S1
+    d2 = (S2 * y0 * y0 - 2.0 * S1 * y0 * y1 + S0 * y1 * y1) / det
+    close, agrees = near.any(axis=0), (near & (d2 < GATE * GATE)).any(axis=0)
+    area = np.pi * GATE * GATE * np.where(near, np.sqrt(det), 0.0).sum(axis=0)
+    p = 1.0 - np.exp(-area[close] / (np.pi * WINDOW * WINDOW))
+    q = np.maximum(p, AGREEING)
+    odds = np.where(agrees[close], np.log(q / p), 0.0)
+    hidden = ~agrees[close] & (p < q)
+    odds[hidden] = np.log((1.0 - q[hidden]) / (1.0 - p[hidden]))
+    return float(odds.sum()), agrees, close

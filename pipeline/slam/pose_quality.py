@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled
 from pipeline.slam.motion import Noise, OdometryTrust, wrapped
 from pipeline.slam.rigid_shift_test import FAMILIAR, MANY
 from pipeline.types.records import SIGMA_XY_MAX, Health, HealthState
@@ -74,7 +73,6 @@ def named_statistics(mean: Float, odometry: float, detections: int) -> ScanStati
     )
 
 
-@compiled
 def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float) -> tuple[Float, float]:
     """Return the weighted mean of the columns over the particles, shape (STATISTICS,), and the Mahalanobis
     norm of the mean SHIFT [sigma], with SIGMA_FLOOR squared added to the variances of the motion.
@@ -84,14 +82,10 @@ def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float)
         weights: Weights with sum 1, shape (P,).
         motion_covariance: Covariance of the odometry since the last used scan, shape (3, 3).
     """
-    mean = np.zeros(STATISTICS)
-    for p in range(statistics.shape[0]):
-        for i in range(STATISTICS):
-            mean[i] += weights[p] * statistics[p, i]
-    return mean, np.sqrt(_mahalanobis2(mean[SHIFT], motion_covariance))
+    mean = weights @ statistics
+    return mean, math.sqrt(_mahalanobis2(mean[SHIFT], motion_covariance))
 
 
-@compiled
 def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> float:
     """Return the Mahalanobis distance of two motions [sigma]. The yaw difference is wrapped.
 
@@ -101,26 +95,13 @@ def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> floa
     """
     shift = by_trees - by_odometry
     shift[2] = wrapped(shift[2])
-    return float(np.sqrt(_mahalanobis2(shift, covariance)))
+    return math.sqrt(_mahalanobis2(shift, covariance))
 
 
-@compiled
 def _mahalanobis2(shift: Float, covariance: Float) -> float:
-    """Return d^T (P + F)^-1 d by Gaussian elimination, where F is the diagonal of SIGMA_FLOOR squared, for d
+    """Return d^T (P + F)^-1 d where F is the diagonal of SIGMA_FLOOR squared, for d
     = `shift`, shape (3,), and P = `covariance`, shape (3, 3)."""
-    P = covariance.copy()
-    for i in range(3):
-        P[i, i] += SIGMA_FLOOR[i] ** 2
-    d = shift.copy()
-    square = 0.0
-    for i in range(3):
-        square += d[i] * d[i] / P[i, i]
-        for j in range(i + 1, 3):
-            factor = P[j, i] / P[i, i]
-            d[j] -= factor * d[i]
-            for k in range(i, 3):
-                P[j, k] -= factor * P[i, k]
-    return square
+    return float(shift @ np.linalg.solve(covariance + np.diag(SIGMA_FLOOR**2), shift))
 
 
 # A strange scan misses nearly all known trees in free view. After STRANGE_LOST of them in a row the robot is
@@ -250,7 +231,6 @@ def update_statistics(
     )
 
 
-@compiled
 def distance_without_trees(alone: float, recognised: float, driven: float) -> float:
     """Return the distance driven since the last scan with at least FEWEST recognised trees [m]: 0 after such
     a scan, else `alone` plus `driven`.
@@ -270,7 +250,6 @@ def decayed_distrust(distrust: float, period: float) -> float:
     return left if left > 0.01 else 0.0
 
 
-@compiled
 def updated_familiar(familiar: float, recognised: float, detections: int) -> float:
     """Return the running mean of the share of detections of well-known landmarks after one more scan.
 

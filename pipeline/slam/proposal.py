@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.geometry.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
 from pipeline.geometry.hash_grid import Cells, cell_of, first_of_four
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing
+from pipeline.jit import compiled_borrowing
 from pipeline.slam.joint_association import CHOICES, MOST, JointSearch, choose_jointly, search_for
 from pipeline.slam.pose_quality import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
 from pipeline.types.records import Bool, Int, Int32
@@ -55,7 +55,6 @@ class Room(NamedTuple):
     search: JointSearch
 
 
-@compiled
 def room_for(detections: int, landmarks: int) -> Room:
     """Return work arrays with space for all pairs of these numbers of detections and landmarks. `sequence`
     holds the detections in ascending order; the other arrays are uninitialised."""

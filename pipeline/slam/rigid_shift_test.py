@@ -13,12 +13,13 @@ pair that agrees with the odometry and not with the motion refutes it.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.detection.free_space import BEHIND
-from pipeline.geometry.azimuth_bins import direction_bin
+from pipeline.geometry.azimuth_bins import direction_bins
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import OdometryTrust, inverted
@@ -42,7 +43,6 @@ LEVER = 5.0  # m; distance of a typical tree
 MISFIT = 3.0  # maximum mean squared deviation, relative to the variances, of a rigid motion
 
 
-@compiled
 def estimate_rigid_shift(
     pose: Float,
     position: float,
@@ -81,31 +81,24 @@ def estimate_rigid_shift(
     fit = _fitted(pose, centre, R, known, spread, well, trust)
     if fit.agree > 0:
         fit = _fitted(fit.place, centre, R, known, spread, well, trust)
-    place, agree, N_inv = fit.place, fit.agree, fit.covariance
+    place, agree, nothing = fit.place, fit.agree, (False, False, fit.place, fit.covariance)
     if agree == 0:
-        return False, False, place, N_inv
+        return nothing
     shift = place - pose
-    away = shift[0] * shift[0] + shift[1] * shift[1] + (LEVER * shift[2]) ** 2
     least = LEAST + trust.distrust * (STILL_LEAST - LEAST)
+    if fit.misfit > MISFIT or math.hypot(shift[0], shift[1], LEVER * shift[2]) < least:
+        return nothing
     # Landmarks that other trees hide are not expected.
-    expected = fit.voting + _missed(place, centre, known, fit.votes, fit.owner, clear_range)
-    if agree < CONVINCING * expected or fit.misfit > MISFIT or away < least * least:
-        return False, False, place, N_inv
+    if agree < CONVINCING * (fit.voting + _missed(place, centre, known, fit.votes, fit.owner, clear_range)):
+        return nothing
     lever, off, variance, _ = _pair_arrays(pose, centre, R, known, spread, fit.owner)
     if _standing(lever, off, variance, position, heading, fit.square, fit.kept) > agree // STANDING:
-        return False, False, place, N_inv
-    N_inv *= max(1.0, fit.misfit)
-    S = N_inv.copy()
-    S[0, 0] += position
-    S[1, 1] += position
-    S[2, 2] += heading
-    S_inv, _ = inverted(S)
-    total, beyond = 0.0, BEYOND + trust.distrust * (STILL_BEYOND - BEYOND)
-    for i in range(3):
-        for j in range(3):
-            total += shift[i] * S_inv[i, j] * shift[j]
-    significant, enough = total > beyond * beyond, agree >= SEVERAL or trust.distrust > 0.0
-    return significant and enough, significant and not enough, place, N_inv
+        return nothing
+    covariance = fit.covariance * max(1.0, fit.misfit)
+    total = shift @ np.linalg.solve(covariance + np.diag([position, position, heading]), shift)
+    beyond = BEYOND + trust.distrust * (STILL_BEYOND - BEYOND)
+    significant, enough = bool(total > beyond * beyond), agree >= SEVERAL or trust.distrust > 0.0
+    return significant and enough, significant and not enough, place, covariance
 
 
 class Fit(NamedTuple):
@@ -165,7 +158,6 @@ def _fitted(
     return Fit(agree, pose + motion, N_inv, misfit, votes, voting, owner, square, kept)
 
 
-@compiled
 def _missed(place: Float, centre: Float, known: Float, votes: Bool, owner: Int, clear_range: Float) -> int:
     """Return the number of landmarks in `votes` that are in free view at a pose and no farther than the
     farthest detection, but have no detection.
@@ -178,19 +170,14 @@ def _missed(place: Float, centre: Float, known: Float, votes: Bool, owner: Int, 
         owner: Detection of each landmark, -1 for none, int64, shape (L,).
         clear_range: Free distance by azimuth in the base frame, shape (bins,) [m].
     """
-    missed, farthest, c, s = 0, 0.0, np.cos(place[2]), np.sin(place[2])
-    for d in range(centre.shape[0]):
-        farthest = max(farthest, centre[d, 0] ** 2 + centre[d, 1] ** 2)
-    for j in range(known.shape[0]):
-        if owner[j] >= 0 or not votes[j]:
-            continue
-        dx, dy = known[j, 0] - place[0], known[j, 1] - place[1]
-        free = clear_range[direction_bin(c * dx + s * dy, c * dy - s * dx, clear_range.shape[0])] - BEHIND
-        missed += free > 0.0 and min(free * free, farthest) > dx * dx + dy * dy
-    return missed
+    farthest = (centre * centre).sum(axis=1).max(initial=0.0)
+    c, s = math.cos(place[2]), math.sin(place[2])
+    ahead = (known - place[:2]) @ np.array([[c, -s], [s, c]])
+    free = np.maximum(clear_range[direction_bins(ahead, len(clear_range))] - BEHIND, 0.0)
+    seen = np.minimum(free * free, farthest) > (ahead * ahead).sum(axis=1)
+    return int(np.count_nonzero(seen & votes & (owner < 0)))
 
 
-@compiled
 def _standing(
     lever: Float, off: Float, variance: Float, position: float, heading: float, shifted: Float, kept: Bool
 ) -> int:
@@ -205,13 +192,9 @@ def _standing(
         shifted: Squared deviations at the shifted pose, shape (K,) [m^2].
         kept: Which pairs agree with the shifted pose, shape (K,).
     """
-    standing = 0
-    for k in range(lever.shape[0]):
-        square, far2 = off[k, 0] ** 2 + off[k, 1] ** 2, lever[k, 0] ** 2 + lever[k, 1] ** 2
-        if square > AGREE * AGREE * (variance[k] + position + far2 * heading):
-            continue
-        standing += shifted[k] > square + (CLEARLY * variance[k] if kept[k] else 0.0)
-    return standing
+    square, far2 = (off * off).sum(axis=1), (lever * lever).sum(axis=1)
+    agrees = square <= AGREE * AGREE * (variance + position + far2 * heading)
+    return int(np.count_nonzero(agrees & (shifted > square + np.where(kept, CLEARLY * variance, 0.0))))
 
 
 @compiled

@@ -7,13 +7,14 @@ filter are too narrow for it, and the filter would begin all trees a second time
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.slam.motion import OdometryTrust, drift_variances, moved_pose
+from pipeline.slam.motion import OdometryTrust, drift_variances, moved_pose, wrapped
 from pipeline.slam.rigid_shift_test import STANDING, estimate_rigid_shift
 from pipeline.types.records import Int32
 
@@ -73,7 +74,6 @@ def slip_message(motion: Float, corrected: bool, unsure: bool, registered: bool 
     return UNSURE if unsure else ""
 
 
-@compiled
 def motion_by_trees(
     before: Float,
     motion: Float,
@@ -118,17 +118,13 @@ def motion_by_trees(
         pose, position, heading, trust, centre, R, known, spread, well_known, clear_range
     )
     if sure:
-        reduced = np.zeros((3, 3))
-        reduced[0, 0] = reduced[1, 1] = FITTED[0] ** 2 + OWN * OWN * max(fitted[0, 0], fitted[1, 1])
-        reduced[2, 2] = FITTED[2] ** 2 + OWN * OWN * fitted[2, 2]
+        xx, yy, tt = np.diag(fitted).tolist()
+        reduced = np.diag(FITTED**2 + OWN * OWN * np.array([max(xx, yy), max(xx, yy), tt]))
         return TreeMotion(True, _from(before, place), reduced, False)
     well = known[well_known]
     sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
     hits, expected, by_chance = count_matches(pose, centre, sigma, well, position, heading, gate)
-    reduced = np.zeros((3, 3))
-    reduced[0, 0], reduced[1, 1], reduced[2, 2] = position, position, heading
-    for i in range(3):
-        reduced[i, i] += SIGMA[i] ** 2
+    reduced = np.diag(np.array([position, position, heading]) + SIGMA**2)
     if expected < FEWEST or hits >= EXPLAINED * expected:
         wide = covariance[0, 0] + covariance[1, 1] > 2.0 * WIDE * WIDE
         if wide and expected >= FEWEST and hits >= CONVINCING * expected:
@@ -140,14 +136,12 @@ def motion_by_trees(
     return TreeMotion(True, _from(before, place), reduced, False)
 
 
-@compiled
 def _from(before: Float, place: Float) -> Float:
     """Return the pose `place` relative to the pose `before`: x, y [m], yaw [rad], wrapped, shape (3,). Both
     poses are x, y [m], yaw [rad] in the map."""
-    c, s = np.cos(before[2]), np.sin(before[2])
-    dx, dy = place[0] - before[0], place[1] - before[1]
-    turn = (place[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
-    return np.array([c * dx + s * dy, c * dy - s * dx, turn])
+    c, s = math.cos(before[2]), math.sin(before[2])
+    dx, dy, turn = (place - before).tolist()
+    return np.array([c * dx + s * dy, c * dy - s * dx, wrapped(turn)])
 
 
 @compiled

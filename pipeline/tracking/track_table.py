@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled
 from pipeline.types.records import Bool, Int, Verdict
 
 NO_LANDMARK = -1
@@ -182,8 +181,13 @@ class Rows(NamedTuple):
     verdict: Int
 
 
-@compiled
-def join(rows: Rows, old: int, young: int) -> None:
+_SUMS = (
+    "hits", "eccentricity", "eccentricities", "radius", "radius_weight", "radius_reach", "radius_spacing",
+    "radius_above", "radii",
+)  # fmt: skip
+
+
+def join(tracks: TrackTable, old: int, young: int) -> None:
     """Join the track of row `young` to that of row `old`, in place.
 
     The track whose landmark has the larger score (`old` for equal scores) gives landmark, state, covariance
@@ -193,31 +197,19 @@ def join(rows: Rows, old: int, young: int) -> None:
     that of `young` if `old` has none. The row `old` keeps its number. The row `young` stays unchanged; the
     caller removes it.
     """
-    x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
-    hits, sides, verdict = rows.hits, rows.sides, rows.verdict
     # Two parts of one trunk in the last scan count once; earlier scans with both parts count twice.
-    if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
-        hits[old] -= 1
-    first_ns[old] = min(first_ns[old], first_ns[young])
-    sides[old] |= sides[young]
+    if tracks.stamp_ns[old] == tracks.stamp_ns[young] and min(tracks.hits[old], tracks.hits[young]) > 0:
+        tracks.hits[old] -= 1
+    tracks.first_ns[old] = min(tracks.first_ns[old], tracks.first_ns[young])
+    tracks.sides[old] |= tracks.sides[young]
     # A track without class does not change the class of the other one.
-    if verdict[young] == Verdict.TREE or verdict[old] < 0:
-        verdict[old] = verdict[young]
-    hits[old] += hits[young]
-    if rows.landmark[young] != NO_LANDMARK and (
-        rows.landmark[old] == NO_LANDMARK or rows.score[young] > rows.score[old]
+    if tracks.verdict[young] == Verdict.TREE or tracks.verdict[old] < 0:
+        tracks.verdict[old] = tracks.verdict[young]
+    if tracks.landmark[young] != NO_LANDMARK and (
+        tracks.landmark[old] == NO_LANDMARK or tracks.score[young] > tracks.score[old]
     ):
-        rows.landmark[old] = rows.landmark[young]
-        x[old], P[old], shared[old], stamp_ns[old] = x[young], P[young], shared[young], stamp_ns[young]
-    rows.score[old] = max(rows.score[old], rows.score[young])
-    for total in (
-        rows.eccentricity,
-        rows.radius,
-        rows.radius_weight,
-        rows.radius_reach,
-        rows.radius_spacing,
-        rows.radius_above,
-    ):
-        total[old] += total[young]
-    for number in (rows.eccentricities, rows.radii):
-        number[old] += number[young]
+        for name in ("landmark", "x", "P", "shared", "stamp_ns"):
+            getattr(tracks, name)[old] = getattr(tracks, name)[young]
+    tracks.score[old] = max(tracks.score[old], tracks.score[young])
+    for name in _SUMS:
+        getattr(tracks, name)[old] += getattr(tracks, name)[young]

@@ -13,15 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.config.stages import Classification, Tracking
-from pipeline.geometry.gaussian import by_pose, in_map, spread_by_pose
+from pipeline.geometry.gaussian import in_map, rows_of, spread_by_pose
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing
 from pipeline.slam.association import associate
 from pipeline.tracking.kalman import ENGINES, split
 from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
 from pipeline.tracking.track_classification import classify, classify_new
-from pipeline.tracking.track_table import NO_LANDMARK, Rows, ScanPose, TrackTable, join
+from pipeline.tracking.track_table import NO_LANDMARK, ScanPose, TrackTable, join
 from pipeline.types.records import Bool, Columns, Detections, Int, Landmarks, PoseEstimate, Trees, Verdict
 
 NANOSECONDS = 1e-9
@@ -84,7 +83,7 @@ class Tracker:
         row = tracks_of(self.tracks.landmark, births)
         position, own, added = in_map(d.centre, d.covariance, scan.pose, scan.covariance)
         take_better_landmarks(
-            self.tracks.as_rows(), stamp_ns, row, births, position, landmarks.birth, landmarks.score,
+            self.tracks, stamp_ns, row, births, position, landmarks.birth, landmarks.score,
             p.proximity_radius,
         )  # fmt: skip
 
@@ -110,7 +109,7 @@ class Tracker:
             self.tracks.as_rows(), row[known], position[known], scan.pose, d.eccentricity[known],
             d.radius[known], d.radius_sigma[known], d.arc[known], above[known], self._spacing,
         )  # fmt: skip
-        kept = merge_near(self.tracks.as_rows(), rows, p.proximity_radius)
+        kept = merge_near(self.tracks, rows, p.proximity_radius)
         if not kept.all():
             self.tracks = self.tracks.take(kept)
 
@@ -227,7 +226,7 @@ class Tracker:
         relative = estimate.covariance if estimate.relative is None else estimate.relative
         self._scan = ScanPose(stamp_ns, estimate.T_map_base.as_array(), estimate.covariance, relative)
         kept = follow(
-            self.tracks.as_rows(), self._scan, landmarks.birth, landmarks.position, landmarks.covariance,
+            self.tracks, self._scan, landmarks.birth, landmarks.position, landmarks.covariance,
             landmarks.score, float(gate), float(distance_max),
         )  # fmt: skip
         if not kept.all():
@@ -289,9 +288,8 @@ SAME_VISIT_NS = 10_000_000_000
 TREE = int(Verdict.TREE)
 
 
-@compiled
 def follow(
-    rows: Rows,
+    tracks: TrackTable,
     scan: ScanPose,
     birth: Int,
     position: Float,
@@ -309,7 +307,7 @@ def follow(
     landmark.
 
     Args:
-        rows: Tracks; landmark, score and, for joined tracks, all columns are changed.
+        tracks: Tracks; landmark, score and, for joined tracks, all columns are changed.
         scan: Pose of the robot.
         birth: Birth numbers of the landmarks, int64, shape (L,).
         position: Positions of the landmarks in the map, shape (L, 2) [m].
@@ -322,56 +320,64 @@ def follow(
         Which tracks remain, shape (T,): those with a landmark, and trees by the class of their voxel column.
         The caller removes the others.
     """
-    T, L = rows.number.shape[0], birth.shape[0]
+    T, L = len(tracks), len(birth)
     order = np.argsort(birth)
-    ordered = birth[order]
-    owner, landmark_of, before = np.full(L, -1), np.full(T, -1), rows.landmark.copy()
-    for t in range(T):
-        k = np.searchsorted(ordered, rows.landmark[t])
-        if k < L and ordered[k] == rows.landmark[t] and owner[order[k]] < 0:
-            owner[order[k]] = t
-            landmark_of[t] = order[k]
+    at = np.minimum(np.searchsorted(birth[order], tracks.landmark), L - 1)
+    found = birth[order[at]] == tracks.landmark if L else np.zeros(T, np.bool_)
+    has, first = np.unique(at[found], return_index=True)
+    owner, landmark_of, before = np.full(L, -1), np.full(T, -1), tracks.landmark.copy()
+    owner[order[has]] = np.flatnonzero(found)[first]
+    landmark_of[owner[order[has]]] = order[has]
     kept = np.ones(T, np.bool_)
     lost = np.flatnonzero(landmark_of < 0)
-    spread = np.empty((T, 3))
-    _fill_spread(rows, scan, spread)
-    if lost.shape[0] > 0 and L > 0:
-        free = np.flatnonzero(owner < 0)
-        at, _ = associate(
-            rows.x[lost][:, :2].copy(), spread[lost], position[free], covariance[free], gate, distance_max
+    if len(lost) and L:
+        spread = rows_of(
+            tracks.P[:, :2, :2] - tracks.shared + spread_by_pose(tracks.x[:, :2], scan.pose, scan.relative)
         )
-        for k in range(lost.shape[0]):
-            if at[k] >= 0:
-                j = free[at[k]]
-                owner[j], landmark_of[lost[k]] = lost[k], j
-                rows.landmark[lost[k]], rows.score[lost[k]] = birth[j], score[j]
+        at = _partners(tracks, lost, spread, owner < 0, position, covariance, gate, distance_max)
+        for t, j in zip(lost[at >= 0].tolist(), at[at >= 0].tolist(), strict=True):
+            owner[j], landmark_of[t] = t, j
+            tracks.landmark[t], tracks.score[t] = birth[j], score[j]
         # A landmark that is gone while another track has the one at its position was merged with it.
         merged = lost[(landmark_of[lost] < 0) & (before[lost] != NO_LANDMARK)]
-        if merged.shape[0] > 0:
-            taken = np.flatnonzero(owner >= 0)
-            at, _ = associate(
-                rows.x[merged][:, :2].copy(), spread[merged], position[taken], covariance[taken], gate,
-                distance_max,
-            )  # fmt: skip
-            for k in range(merged.shape[0]):
-                if at[k] >= 0:
-                    j = taken[at[k]]
-                    rows.landmark[merged[k]] = NO_LANDMARK
-                    old, young = min(owner[j], merged[k]), max(owner[j], merged[k])
-                    join(rows, old, young)
-                    landmark_of[old], landmark_of[young] = j, -1
-                    owner[j] = old
-                    kept[young] = False
-    for t in range(T):
-        j = landmark_of[t]
-        rows.landmark[t] = birth[j] if j >= 0 else NO_LANDMARK
-        if j >= 0:
-            rows.score[t] = score[j]
-        kept[t] = kept[t] and (j >= 0 or rows.verdict[t] == TREE)
+        at = _partners(tracks, merged, spread, owner >= 0, position, covariance, gate, distance_max)
+        for t, j in zip(merged[at >= 0].tolist(), at[at >= 0].tolist(), strict=True):
+            tracks.landmark[t] = NO_LANDMARK
+            old, young = sorted((int(owner[j]), t))
+            join(tracks, old, young)
+            landmark_of[old], landmark_of[young] = j, -1
+            owner[j] = old
+            kept[young] = False
+    has_landmark = landmark_of >= 0
+    tracks.landmark[:] = NO_LANDMARK
+    tracks.landmark[has_landmark] = birth[landmark_of[has_landmark]]
+    tracks.score[has_landmark] = score[landmark_of[has_landmark]]
+    kept &= has_landmark | (tracks.verdict == TREE)
     return kept
 
 
-@compiled
+def _partners(
+    tracks: TrackTable,
+    rows: Int,
+    spread: Float,
+    among: Bool,
+    position: Float,
+    covariance: Float,
+    gate: float,
+    distance_max: float,
+) -> Int:
+    """Return the landmark of the tracks `rows` by `associate`, of those `among` them, int64, shape (R,); -1
+    for none. The other arguments are those of `follow`; `spread` is the covariance xx, xy, yy of each track
+    relative to the landmarks, shape (T, 3) [m^2]."""
+    if not len(rows) or not among.any():
+        return np.full(len(rows), -1)
+    landmarks = np.flatnonzero(among)
+    at, _ = associate(
+        tracks.x[rows, :2], spread[rows], position[among], covariance[among], gate, distance_max
+    )
+    return np.where(at >= 0, landmarks[at], -1)
+
+
 def tracks_of(landmark: Int, births: Int) -> Int:
     """Return the row of the track of each detection, int64, shape (D,); -1 for none.
 
@@ -379,19 +385,16 @@ def tracks_of(landmark: Int, births: Int) -> Int:
         landmark: Birth number of the landmark of each track, shape (T,).
         births: Birth number of the landmark of each detection, shape (D,); -1 for none.
     """
-    rows = np.full(births.shape[0], -1)
     order = np.argsort(landmark)
-    ordered = landmark[order]
-    for d in range(births.shape[0]):
-        k = np.searchsorted(ordered, births[d])
-        if births[d] != NO_LANDMARK and k < landmark.shape[0] and ordered[k] == births[d]:
-            rows[d] = order[k]
-    return rows
+    at = np.minimum(np.searchsorted(landmark[order], births), max(len(order) - 1, 0))
+    if not len(order):
+        return np.full(len(births), -1)
+    row = order[at]
+    return np.where((births != NO_LANDMARK) & (landmark[row] == births), row, -1)
 
 
-@compiled
 def take_better_landmarks(
-    rows: Rows,
+    tracks: TrackTable,
     stamp_ns: int,
     row: Int,
     births: Int,
@@ -405,7 +408,7 @@ def take_better_landmarks(
     landmark if this has a higher score than its own landmark or it has none.
 
     Args:
-        rows: Tracks; landmark and score are changed.
+        tracks: Tracks; landmark and score are changed.
         stamp_ns: Time of the scan [ns].
         row: Row of the track of each detection, -1 for none, int64, shape (D,); changed.
         births: Birth number of the landmark of each detection, shape (D,); -1 for none.
@@ -414,55 +417,46 @@ def take_better_landmarks(
         score: Scores of the landmarks, hits minus misses, shape (L,).
         radius: Distance below which a detection belongs to a track [m].
     """
-    detected = np.zeros(rows.number.shape[0], np.bool_)
-    for d in range(row.shape[0]):
-        if row[d] >= 0:
-            detected[row[d]] = True
-    for d in range(row.shape[0]):
-        if row[d] >= 0 or births[d] == NO_LANDMARK:
+    detected = np.zeros(len(tracks), np.bool_)
+    detected[row[row >= 0]] = True
+    for d in np.flatnonzero((row < 0) & (births != NO_LANDMARK)).tolist():
+        away = ((tracks.x[:, :2] - position[d]) ** 2).sum(axis=1)
+        nearest = int(away.argmin()) if len(tracks) else -1
+        if nearest < 0 or away[nearest] >= radius * radius or detected[nearest]:
             continue
-        nearest, least = -1, radius * radius
-        for t in range(rows.number.shape[0]):
-            dx, dy = rows.x[t, 0] - position[d, 0], rows.x[t, 1] - position[d, 1]
-            if dx * dx + dy * dy < least:
-                nearest, least = t, dx * dx + dy * dy
-        if nearest < 0 or detected[nearest] or stamp_ns - rows.first_ns[nearest] > SAME_VISIT_NS:
+        (j,) = np.flatnonzero(birth == births[d])[:1] if (birth == births[d]).any() else (-1,)
+        if stamp_ns - tracks.first_ns[nearest] > SAME_VISIT_NS or j < 0:
             continue
-        for j in range(birth.shape[0]):
-            if birth[j] == births[d] and (
-                rows.landmark[nearest] == NO_LANDMARK or score[j] > rows.score[nearest]
-            ):
-                rows.landmark[nearest], rows.score[nearest] = births[d], score[j]
-                row[d] = nearest
-                detected[nearest] = True
+        if tracks.landmark[nearest] == NO_LANDMARK or score[j] > tracks.score[nearest]:
+            tracks.landmark[nearest], tracks.score[nearest] = births[d], score[j]
+            row[d], detected[nearest] = nearest, True
 
 
-@compiled
-def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
+def merge_near(tracks: TrackTable, seen: Int, radius: float) -> Bool:
     """Join the tracks that are nearer than a radius to a track that moved, in place.
 
     The lower row, which is the older track, remains; see `join`.
 
     Args:
-        rows: Tracks.
+        tracks: Tracks.
         seen: Rows of the tracks that moved in this scan, shape (K,).
         radius: Distance below which two tracks are one tree [m].
 
     Returns:
         Which tracks remain, shape (T,); the caller removes the others.
     """
-    kept = np.ones(rows.number.shape[0], np.bool_)
-    for k in range(seen.shape[0]):
-        for t in range(kept.shape[0]):
-            s = seen[k]
-            dx, dy = rows.x[t, 0] - rows.x[s, 0], rows.x[t, 1] - rows.x[s, 1]
-            if t != s and kept[s] and kept[t] and dx * dx + dy * dy < radius * radius:
-                join(rows, min(s, t), max(s, t))
+    kept = np.ones(len(tracks), np.bool_)
+    x = tracks.x[:, :2]
+    if np.count_nonzero(_square(x[seen, None], x) < radius * radius) == len(seen):
+        return kept  # each track is near itself only
+    for s in seen.tolist():
+        for t in range(len(kept)):
+            if t != s and kept[s] and kept[t] and _square(x[t], x[s]) < radius * radius:
+                join(tracks, min(s, t), max(s, t))
                 kept[max(s, t)] = False
     return kept
 
 
-@compiled
 def are_separate(position: Float, x: Float, radius: float) -> Bool:
     """Return which positions may begin a tree, shape (K,): those at least a radius from all tracks and from
     accepted positions before them.
@@ -472,25 +466,14 @@ def are_separate(position: Float, x: Float, radius: float) -> Bool:
         x: States of the tracks, x, y [m] first, shape (T, 4).
         radius: Minimum distance [m].
     """
-    apart = np.ones(position.shape[0], np.bool_)
-    for k in range(position.shape[0]):
-        for t in range(x.shape[0]):
-            dx, dy = x[t, 0] - position[k, 0], x[t, 1] - position[k, 1]
-            apart[k] = apart[k] and dx * dx + dy * dy >= radius * radius
-        for j in range(k):
-            dx, dy = position[j, 0] - position[k, 0], position[j, 1] - position[k, 1]
-            apart[k] = apart[k] and not (apart[j] and dx * dx + dy * dy < radius * radius)
+    apart: Bool = (_square(position[:, None], x[:, :2]) >= radius * radius).all(axis=1)
+    for k in range(1, len(position)):
+        apart[k] &= not (apart[:k] & (_square(position[:k], position[k]) < radius * radius)).any()
     return apart
 
 
-@compiled_borrowing
-def _fill_spread(rows: Rows, scan: ScanPose, spread: Float) -> None:
-    """Write the covariance xx, xy, yy of the position of each track relative to the landmarks into `spread`,
-    shape (T, 3) [m^2]: P without its shared part, plus what the covariance of the present pose relative to
-    the landmarks adds at the track."""
-    x, P, shared = rows.x, rows.P, rows.shared
-    for t in range(spread.shape[0]):
-        xx, xy, yy = by_pose(x[t, 0] - scan.pose[0], x[t, 1] - scan.pose[1], scan.relative)
-        spread[t, 0] = P[t, 0, 0] - shared[t, 0, 0] + xx
-        spread[t, 1] = P[t, 0, 1] - shared[t, 0, 1] + xy
-        spread[t, 2] = P[t, 1, 1] - shared[t, 1, 1] + yy
+def _square(a: Float, b: Float) -> Float:
+    """Return the squared distances of positions, x, y in the last axis [m^2]; shapes are broadcast."""
+    away = a - b
+    square: Float = np.einsum("...i,...i->...", away, away)
+    return square

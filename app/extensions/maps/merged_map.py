@@ -82,7 +82,7 @@ def merge_maps(
     distance[~fresh] = np.hypot(gap[:, 0], gap[:, 1])
     both = a.tracks.extended(moved)
     for k in np.flatnonzero(~fresh):
-        join(both.as_rows(), int(row_of[k]), len(a.tracks) + int(k))
+        join(both, int(row_of[k]), len(a.tracks) + int(k))
     matched = row_of[~fresh]
     shown = (moved.verdict[~fresh] < 0) & (moved.hits[~fresh] >= parameters.tracking.hits_to_confirm)
     hidden = ((a.tracks.verdict[matched] < 0) | shown) & (both.verdict[matched] != Verdict.TREE)

@@ -22,9 +22,7 @@ from app.worker.numba_warmup import compiled_share, is_compiled, map_scene, warm
 from app.worker.process import new_session
 from app.worker.protocol import Open
 from pipeline.config import Parameters
-from pipeline.slam.particle_ancestry import best_after_resampling
 from pipeline.slam.particle_maps import take_ancestors
-from pipeline.slam.places import agreement
 from pipeline.tracking.track_classification import classify_new
 
 
@@ -41,7 +39,7 @@ warm_tree_map()
 assert is_compiled()
 assert compiled_share() > 0.95, compiled_share()
 # What a run calls later: at a resampling, at a revisit, and with the first tree of a column.
-late = [take_ancestors, best_after_resampling, agreement, classify_new]
+late = [take_ancestors, classify_new]
 assert all(kernel.signatures for kernel in late), [kernel.signatures for kernel in late]
 before = seen()
 assert len(before) > 20, before

@@ -113,7 +113,7 @@ def test_two_halves_of_a_tree_know_their_diameter_as_one_tree_does():
         for t in (whole, low if height < 1.0 else high):
             show(t, k, 4.0, 0.15, 0.02, height)
     halves = low.tracks.extended(high.tracks)
-    join(halves.as_rows(), 0, 1)
+    join(halves, 0, 1)
     low.tracks = halves.take(np.array([True, False]))
     assert low.trees().dbh == pytest.approx(whole.trees().dbh)
     assert low.trees().dbh_sigma == pytest.approx(whole.trees().dbh_sigma)

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 
 from pipeline.config import preset
-from pipeline.geometry.gaussian import Pose
 from pipeline.geometry.poses import Pose2
 from pipeline.slam import FastSlam
 from pipeline.slam.motion import Motion
@@ -34,7 +33,7 @@ from tests.pipeline.strategies import detections, seeds
 
 R = [0.03**2, 0.0, 0.03**2]
 TREES = np.array([[3.0, 4.0], [6.0, -3.0], [9.0, 2.0]])
-EXACT = Pose(0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-8)
+EXACT = np.diag([1e-6, 1e-6, 1e-8])
 
 
 def line(scans: int = 31, step: float = PLACE) -> Places:
@@ -53,9 +52,10 @@ def test_only_landmarks_of_contradicted_places_are_not_usable() -> None:
     assert Places().is_usable(births).all()
 
 
-def of_stand(trees: np.ndarray, shown: np.ndarray, pose: Pose = EXACT) -> tuple[float, np.ndarray]:
+def of_stand(trees: np.ndarray, shown: np.ndarray, P: np.ndarray = EXACT) -> tuple[float, np.ndarray]:
     """Log odds of the trees and which of them agree, for exact detections."""
-    odds, agrees, _ = agreement(pose, shown, np.tile(R, (len(shown), 1)), trees, np.tile(R, (len(trees), 1)))
+    own, of_map = np.tile(R, (len(shown), 1)), np.tile(R, (len(trees), 1))
+    odds, agrees, _ = agreement(np.zeros(3), P, shown, own, trees, of_map)
     return odds, agrees
 
 
@@ -84,17 +84,17 @@ def test_few_landmarks_do_not_decide():
     odds, _ = of_stand(trees, np.array([[6.0, 0.0]]))
     assert -ODDS < odds < 0.0
     assert of_stand(trees, np.array([[40.0, 0.0]]))[0] == 0.0, "too far away to say anything"
-    uncertain = EXACT._replace(xx=100.0, yy=100.0)
+    uncertain = np.diag([100.0, 100.0, 1e-8])
     assert of_stand(trees, np.array([[6.0, 0.0]]), uncertain)[0] == 0.0, "any tree agrees with such a pose"
 
 
 def test_odds_of_one_tree_in_closed_form():
     variance = 2.0 * R[0]
-    pose = EXACT._replace(xx=0.0, yy=0.0, tt=0.0)
+    exact = np.zeros((3, 3))
     p = 1.0 - math.exp(-(GATE**2) * variance / WINDOW**2)
     tree = np.array([[3.0, 4.0]])
-    assert of_stand(tree, tree, pose)[0] == pytest.approx(math.log(AGREEING / p))
-    assert of_stand(tree, tree + 1.0, pose)[0] == pytest.approx(math.log((1.0 - AGREEING) / (1.0 - p)))
+    assert of_stand(tree, tree, exact)[0] == pytest.approx(math.log(AGREEING / p))
+    assert of_stand(tree, tree + 1.0, exact)[0] == pytest.approx(math.log((1.0 - AGREEING) / (1.0 - p)))
 
 
 def test_a_place_is_old_after_the_revisit_distance():
