@@ -169,7 +169,6 @@ def seen_higher(columns: Columns) -> Int:
     return tiles
 
 
-@compiled
 def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
     """Return the increase of the visible height of each column since its features were computed, shape (K,)
     [m]: the larger of those by views and by rays. It is negative if less is visible now.
@@ -179,13 +178,9 @@ def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
         met, passed: Rays by slice of height, shape (K, SLICES).
         figures: Features at the classification, shape (K, COUNT).
     """
-    gain = np.zeros(viewed.shape[0])
-    for k in range(gain.shape[0]):
-        highest = 0
-        for s in range(1, met.shape[1]):
-            if met[k, s] + passed[k, s] > 0:
-                highest = s
-        gain[k] = max(viewed[k] - figures[k, _LOOKED], highest * SLICE - figures[k, _RAYS])
+    slices = np.arange(met.shape[1])
+    highest = np.where(met + passed > 0, slices, 0).max(axis=1)
+    gain: Float = np.maximum(viewed - figures[:, _LOOKED], highest * SLICE - figures[:, _RAYS])
     return gain
 
 
@@ -452,7 +447,6 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
     return kept[:n].copy()
 
 
-@compiled
 def _nearest_before(old: Float, axis: Float, first: int) -> Int:
     """Return for each column from row `first` of `axis` onwards the row of the nearest column of `old` within
     SAME (exclusive, at 1.3 m), -1 for none; int64, shape (K - first,).
@@ -462,12 +456,8 @@ def _nearest_before(old: Float, axis: Float, first: int) -> Int:
         axis: Axes of all columns, shape (K, 5).
         first: First row to search for.
     """
-    nearest = np.full(axis.shape[0] - first, -1, np.int64)
-    for k in range(first, axis.shape[0]):
-        best = SAME * SAME
-        for o in range(old.shape[0]):
-            dx, dy = axis[k, 0] - old[o, 0], axis[k, 1] - old[o, 1]
-            if dx * dx + dy * dy < best:
-                best = dx * dx + dy * dy
-                nearest[k - first] = o
-    return nearest
+    dx, dy = np.moveaxis(axis[first:, None, :2] - old[:, :2], 2, 0)
+    square = dx * dx + dy * dy
+    if not len(old):
+        return np.full(len(square), -1)
+    return np.where(square.min(axis=1) < SAME * SAME, square.argmin(axis=1), -1)

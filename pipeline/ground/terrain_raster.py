@@ -24,6 +24,7 @@ CELL = 0.5  # m
 KEPT = 8  # lowest returns of a cell
 TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
 PIT = 0.5  # m; a cell this far below its neighbours is noise
+AT_ONCE = 1_000_000  # points whose heights are computed at once, likewise
 BLOCK = 32  # columns of the raster whose neighbours are sorted at once, to bound the memory
 
 
@@ -54,8 +55,19 @@ class TerrainRaster:
     def evaluate(self, x: Float, y: Float) -> Float:
         """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m], finite; shape (N, 3).
         Outside of the raster, the values at its border are returned."""
-        x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
-        return _evaluate(self.height, self.low, self.cell, np.ascontiguousarray(x), np.ascontiguousarray(y))
+        columns, rows = self.height.shape
+        u = np.clip((x - self.low[0]) / self.cell - 0.5, 0.0, columns - 1.0)
+        v = np.clip((y - self.low[1]) / self.cell - 0.5, 0.0, rows - 1.0)
+        a = np.minimum(u.astype(np.int64), max(columns - 2, 0))
+        b = np.minimum(v.astype(np.int64), max(rows - 2, 0))
+        f, g = u - a, v - b
+        a2, b2 = np.minimum(a + 1, columns - 1), np.minimum(b + 1, rows - 1)
+        h = self.height
+        h00, h10, h01, h11 = h[a, b], h[a2, b], h[a, b2], h[a2, b2]
+        z = (1 - f) * (1 - g) * h00 + f * (1 - g) * h10 + (1 - f) * g * h01 + f * g * h11
+        gx = ((1 - g) * (h10 - h00) + g * (h11 - h01)) / self.cell
+        gy = ((1 - f) * (h01 - h00) + f * (h11 - h10)) / self.cell
+        return np.column_stack([z, gx, gy])
 
     def covered_places(self) -> Float:
         """Return the centres of the cells with any point, shape (N, 2) [m]."""
@@ -129,7 +141,11 @@ class LowestReturns:
 def heights_above(points: Float32, ground: TerrainRaster) -> Float32:
     """Return the height of each point (N, 3) [m], finite, above the ground, float32, shape (N,) [m]; outside
     of the raster, above the ground at its border."""
-    return _heights_above(points, ground.height, ground.low, ground.cell)
+    above = np.empty(len(points), np.float32)
+    for first in range(0, len(points), AT_ONCE):
+        x, y, z = points[first : first + AT_ONCE].T.astype(np.float64)
+        above[first : first + AT_ONCE] = z - ground.at(x, y)
+    return above
 
 
 @compiled
@@ -165,7 +181,6 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
             cell[k, c] = points[i, c]
 
 
-@compiled
 def _supported(lowest: Float32, count: Int32) -> Float:
     """Return the lowest return of each cell that has two more returns close above it, shape (columns, rows,
     3) [m].
@@ -177,21 +192,14 @@ def _supported(lowest: Float32, count: Int32) -> Float:
         lowest: Lowest returns of each cell, shape (columns, rows, KEPT, 3) [m].
         count: Number of returns of each cell, shape (columns, rows).
     """
-    columns, rows = count.shape
-    ground = np.zeros((columns, rows, 3))
-    ground[:, :, 2] = np.inf
-    for a in range(columns):
-        for b in range(rows):
-            kept = min(count[a, b], KEPT)
-            if kept == 0:
-                continue
-            chosen = 0 if kept < 3 else kept - 1
-            for k in range(kept - 2):
-                if lowest[a, b, k + 2, 2] - lowest[a, b, k, 2] < TOGETHER:
-                    chosen = k
-                    break
-            for c in range(3):
-                ground[a, b, c] = lowest[a, b, chosen, c]
+    z, kept = lowest[:, :, :, 2], np.minimum(count, KEPT)
+    together = np.zeros((*count.shape, KEPT), np.bool_)
+    with np.errstate(invalid="ignore"):  # of two infinite heights
+        together[:, :, :-2] = z[:, :, 2:] - z[:, :, :-2] < TOGETHER
+    unsupported = np.where(kept < 3, 0, kept - 1)
+    chosen = np.where(together.any(axis=2), together.argmax(axis=2), unsupported)
+    ground = np.take_along_axis(lowest, chosen[:, :, None, None], axis=2)[:, :, 0].astype(np.float64)
+    ground[kept == 0] = 0.0, 0.0, np.inf
     return ground
 
 
@@ -314,52 +322,3 @@ def _interpolated(places: Float, z: Float, centre: Float) -> Float:
         pass
     smooth: Float = gaussian_filter(height, 1.0, mode="nearest")
     return smooth
-
-
-@compiled
-def _evaluate(height: Float, low: Float, cell: float, x: Float, y: Float) -> Float:
-    """Return height [m] and slopes along x and y, see `ground_at`, at positions x, y of shape (N,) each [m];
-    shape (N, 3)."""
-    out = np.empty((x.shape[0], 3))
-    for i in range(x.shape[0]):
-        out[i, 0], out[i, 1], out[i, 2] = ground_at(height, low, cell, x[i], y[i])
-    return out
-
-
-@compiled
-def ground_at(height: Float, low: Float, cell: float, x: float, y: float) -> tuple[float, float, float]:
-    """Return the height [m] of the raster at a position and its slopes along x and y. Outside of the raster,
-    the values at its border are returned.
-
-    Args:
-        height: Heights at the centres of the cells, shape (columns, rows) [m].
-        low: Corner of the raster, shape (2,) [m].
-        cell: Side of a cell [m].
-        x, y: The position [m].
-    """
-    columns, rows = height.shape
-    u = min(max((x - low[0]) / cell - 0.5, 0.0), columns - 1.0)
-    v = min(max((y - low[1]) / cell - 0.5, 0.0), rows - 1.0)
-    a, b = min(int(u), max(columns - 2, 0)), min(int(v), max(rows - 2, 0))
-    f, g = u - a, v - b
-    a2, b2 = min(a + 1, columns - 1), min(b + 1, rows - 1)
-    h00, h10, h01, h11 = height[a, b], height[a2, b], height[a, b2], height[a2, b2]
-    z = (1 - f) * (1 - g) * h00 + f * (1 - g) * h10 + (1 - f) * g * h01 + f * g * h11
-    gx = ((1 - g) * (h10 - h00) + g * (h11 - h01)) / cell
-    gy = ((1 - f) * (h01 - h00) + f * (h11 - h10)) / cell
-    return z, gx, gy
-
-
-@compiled
-def _heights_above(points: Float32, height: Float, low: Float, cell: float) -> Float32:
-    """Return the height of each point, shape (N, 3) [m], above the raster, float32, shape (N,) [m].
-
-    Args:
-        points: The points, finite.
-        height, low, cell: Heights at the centres of the cells, shape (columns, rows) [m], corner, shape (2,)
-            [m], and side [m] of the raster.
-    """
-    above = np.empty(points.shape[0], np.float32)
-    for i in range(points.shape[0]):
-        above[i] = points[i, 2] - ground_at(height, low, cell, points[i, 0], points[i, 1])[0]
-    return above

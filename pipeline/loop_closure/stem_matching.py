@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Float, Pose2
@@ -93,27 +94,22 @@ def _walk_pairs(
                 n += 1
 
 
-@compiled
 def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
     """Return a grid over stems, shape (N, 2) [m], N > 0: low corner x, y and cell size, shape (3,) [m]; first
     stem of each cell, int32, shape (W, H); and next stem in the same cell of each stem, int32, shape (N,); -1
     if there is none. The cell is doubled from `cell` [m] until at most MOST_CELLS are needed."""
-    grid = np.empty(3)
-    grid[0], grid[1], grid[2] = position[:, 0].min(), position[:, 1].min(), cell
-    width = np.floor((position[:, 0].max() - grid[0]) / grid[2]) + 1.0
-    height = np.floor((position[:, 1].max() - grid[1]) / grid[2]) + 1.0
-    while width * height > MOST_CELLS:
-        grid[2] *= 2.0
-        width = np.floor((position[:, 0].max() - grid[0]) / grid[2]) + 1.0
-        height = np.floor((position[:, 1].max() - grid[1]) / grid[2]) + 1.0
-    first = np.full((int(width), int(height)), -1, np.int32)
-    following = np.full(position.shape[0], -1, np.int32)
-    for j in range(position.shape[0] - 1, -1, -1):
-        a = int((position[j, 0] - grid[0]) / grid[2])
-        b = int((position[j, 1] - grid[1]) / grid[2])
-        following[j] = first[a, b]
-        first[a, b] = j
-    return grid, first, following
+    low, extent = position.min(axis=0), np.ptp(position, axis=0)
+    while np.prod(np.floor(extent / cell) + 1.0) > MOST_CELLS:
+        cell *= 2.0
+    width, height = (np.floor(extent / cell) + 1.0).astype(np.int64).tolist()
+    column, row = ((position - low) / cell).astype(np.int64).T
+    cells = column * height + row
+    order = np.argsort(cells, kind="stable")
+    is_first = np.append(True, np.diff(cells[order]) > 0)
+    first, following = np.full(width * height, -1, np.int32), np.full(len(position), -1, np.int32)
+    first[cells[order[is_first]]] = order[is_first]
+    following[order[:-1]] = np.where(is_first[1:], -1, order[1:])
+    return np.array([*low, cell]), first.reshape(width, height), following
 
 
 @compiled
@@ -328,7 +324,6 @@ def partners(
     return found
 
 
-@compiled
 def crowding(pose: Float, local: Float, reference: Float, window: float) -> tuple[float, int]:
     """Return the density of map stems within `window` of an aligned local stem, mean over all local stems
     [1/m^2], and the number of local stems with at least one map stem within `window`.
@@ -339,18 +334,9 @@ def crowding(pose: Float, local: Float, reference: Float, window: float) -> tupl
         window: Radius [m].
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
-    total, inside = 0, 0
-    for m in range(local.shape[0]):
-        wx = pose[0] + c * local[m, 0] - s * local[m, 1]
-        wy = pose[1] + s * local[m, 0] + c * local[m, 1]
-        near = 0
-        for n in range(reference.shape[0]):
-            dx, dy = reference[n, 0] - wx, reference[n, 1] - wy
-            if dx * dx + dy * dy < window * window:
-                near += 1
-        total += near
-        inside += near > 0
-    return total / (local.shape[0] * np.pi * window * window), inside
+    place = local @ np.array([[c, s], [-s, c]]) + pose[:2]
+    near = np.array([len(rows) for rows in cKDTree(reference).query_ball_point(place, window)])
+    return float(near.sum() / (len(local) * np.pi * window * window)), int(np.count_nonzero(near))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -410,37 +396,23 @@ def worst_sigma(covariance: Float) -> Float:
     return np.sqrt(np.maximum(largest, 0.0))
 
 
-@compiled
-def aligned(local: Float, reference: Float, weight: Float, n: int, out: Float) -> None:
-    """Write the pose T that minimises the weighted sum of |reference - T local|^2 into `out` (Horn 1987, in
-    the plane).
+def aligned(local: Float, reference: Float, weight: Float) -> Float:
+    """Return the pose T, x, y [m], yaw [rad], shape (3,), that minimises the weighted sum of |reference - T
+    local|^2 (Horn 1987, in the plane).
 
     tan yaw = sum w (l x r) / sum w (l . r) of the points about their weighted means. One pair, or coincident
-    points, give the yaw 0; without pairs the result is NaN.
+    points, give the yaw 0.
 
     Args:
-        local, reference: The first `n` rows are pairs, shape (M, 2) [m].
+        local, reference: Pairs, shape (M, 2) [m], M > 0.
         weight: Weights of the pairs, shape (M,) [1/m^2].
-        n: Number of pairs.
-        out: Filled with x, y [m], yaw [rad], shape (3,).
     """
-    total = lx = ly = rx = ry = 0.0
-    for k in range(n):
-        total += weight[k]
-        lx += weight[k] * local[k, 0]
-        ly += weight[k] * local[k, 1]
-        rx += weight[k] * reference[k, 0]
-        ry += weight[k] * reference[k, 1]
-    lx, ly, rx, ry = lx / total, ly / total, rx / total, ry / total
-    dot = cross = 0.0
-    for k in range(n):
-        ax, ay = local[k, 0] - lx, local[k, 1] - ly
-        bx, by = reference[k, 0] - rx, reference[k, 1] - ry
-        dot += weight[k] * (ax * bx + ay * by)
-        cross += weight[k] * (ax * by - ay * bx)
-    yaw = np.arctan2(cross, dot)
+    total = weight.sum()
+    l, r = weight @ local / total, weight @ reference / total  # noqa: E741
+    a, b = (local - l) * weight[:, None], reference - r
+    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
     c, s = np.cos(yaw), np.sin(yaw)
-    out[0], out[1], out[2] = rx - c * lx + s * ly, ry - s * lx - c * ly, yaw
+    return np.array([r[0] - c * l[0] + s * l[1], r[1] - s * l[0] - c * l[1], yaw])
 
 
 def alignment_covariance(pose: Pose2, local: Float, reference: Float, variance: Float) -> Float:
@@ -704,7 +676,6 @@ class _Search:
         """Return a pose x, y [m], yaw [rad], shape (3,), after pairing and alignment in turns until the pairs
         do not change, there are fewer than two, or ROUNDS are over. The argument is unchanged."""
         local, reference = self._local, self._reference
-        pose = pose.copy()
         of, before = np.full(len(local), -1, np.int64), np.full(len(local), -2, np.int64)
         found = 0
         for k in range(ROUNDS):
@@ -717,7 +688,7 @@ class _Search:
             at = np.flatnonzero(of >= 0)
             to = of[at]
             weight = 1.0 / (local.sigma[at] ** 2 + reference.sigma[to] ** 2 + self._p.slack**2)
-            aligned(local.position[at], reference.position[to], weight, found, pose)
+            pose = aligned(local.position[at], reference.position[to], weight)
             before = of.copy()
         return _Candidate(pose, of, found)
 

@@ -466,7 +466,8 @@ def are_separate(position: Float, x: Float, radius: float) -> Bool:
         x: States of the tracks, x, y [m] first, shape (T, 4).
         radius: Minimum distance [m].
     """
-    apart: Bool = (_square(position[:, None], x[:, :2]) >= radius * radius).all(axis=1)
+    near = _square(position[:, None], x[:, :2]) < radius * radius
+    apart: Bool = np.count_nonzero(near, axis=1) == 0
     for k in range(1, len(position)):
         apart[k] &= not (apart[:k] & (_square(position[:k], position[k]) < radius * radius)).any()
     return apart

@@ -181,8 +181,7 @@ def test_the_alignment_is_that_of_scipy(seed, n):
     rng = np.random.default_rng(seed)
     local, weight = rng.normal(0, 5, (n, 2)), rng.uniform(0.5, 2.0, n)
     reference = Pose2(3.0, -2.0, 2.5).apply(local) + rng.normal(0, 0.3, (n, 2))
-    pose = np.empty(3)
-    aligned(local, reference, weight, n, pose)
+    pose = aligned(local, reference, weight)
     middle = [weight @ p / weight.sum() for p in (local, reference)]
     flat = [np.pad(p - m, ((0, 0), (0, 1))) for p, m in zip((local, reference), middle, strict=True)]
     # The third axis is held by a heavy pair along it.
