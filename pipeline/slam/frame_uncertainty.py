@@ -88,21 +88,34 @@ class FrameUncertainty:
         Raises:
             LinAlgError: `spread` is not positive semidefinite.
         """
-        away = mean - pose[:2]
-        near = (hits >= hits_min) & ((away * away).sum(axis=1) <= reach * reach)
-        m = np.searchsorted(self.serial, birth[near], side="right") - 1
-        used, counts = np.unique(m[m >= 0], return_counts=True)
+        used, counts = self._references(pose, mean, birth, hits, hits_min, reach)
         if not len(used):
             hidden = transported_covariance(self.hidden, pose[0] - self.at[0], pose[1] - self.at[1])
             return spread + hidden, replace(self, hidden=hidden, at=pose)
-        A = np.tile(np.eye(3), (len(used), 1, 1))
-        A[:, 0, 2], A[:, 1, 2] = self.pose[used, 1] - pose[1], pose[0] - self.pose[used, 0]
-        parts = A @ self.covariance[used] @ A.transpose(0, 2, 1)
-        weight, smoothed = counts / counts.sum(), self.smoothed[used]
-        least = np.tensordot(weight[~smoothed], parts[~smoothed], 1) + weight[smoothed].sum() * spread
-        of_map = np.tensordot(weight[smoothed], parts[smoothed], 1)
+        least, of_map = np.zeros((3, 3)), np.zeros((3, 3))
+        for m, weight in zip(used.tolist(), (counts / counts.sum()).tolist(), strict=True):
+            dx, dy = (pose[:2] - self.pose[m, :2]).tolist()
+            part = weight * transported_covariance(self.covariance[m], dx, dy)
+            if self.smoothed[m]:
+                least += weight * spread
+                of_map += part
+            else:
+                least += part
         covariance = at_least(spread, least, NOISE / math.sqrt(n_eff)) + of_map
         return covariance, replace(self, hidden=covariance - spread, at=pose)
+
+    def _references(
+        self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
+    ) -> tuple[Int, Int]:
+        """Return the rows of the reference poses to which landmarks in reach belong, ascending, and the
+        numbers of these landmarks, int64, shape (U,) each. The arguments are those of `with_pose`."""
+        if not reach > 0.0 or not len(self.serial):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        dx, dy = mean[:, 0] - pose[0], mean[:, 1] - pose[1]
+        near = (hits >= hits_min) & (dx * dx + dy * dy <= reach * reach)
+        counts = np.bincount(np.searchsorted(self.serial, birth[near], side="right"))[1:]
+        used = np.flatnonzero(counts)
+        return used, counts[used]
 
     def observes_known(
         self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float

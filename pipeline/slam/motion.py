@@ -316,11 +316,11 @@ def weighted_pose(
         motion: Motion since the poses were sampled, the same for all, shape (3,).
         motion_covariance: Covariance of `motion` in the frame in which it begins, shape (3, 3).
     """
-    yaw = math.atan2(float(weights @ np.sin(pose[:, 2])), float(weights @ np.cos(pose[:, 2])))
-    mean = np.append(weights @ pose[:, :2], yaw)
+    x, y, yaw = pose.T
+    mean = np.array([weights @ x, weights @ y, math.atan2(weights @ np.sin(yaw), weights @ np.cos(yaw))])
     away = pose - mean
-    away[:, 2] = wrap_angle(away[:, 2])
-    c, s = math.cos(yaw - motion[2]), math.sin(yaw - motion[2])
+    away[:, 2] = (away[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    c, s = math.cos(mean[2] - motion[2]), math.sin(mean[2] - motion[2])
     C = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    covariance = (away * weights[:, None]).T @ away + C @ motion_covariance @ C.T
+    covariance = away.T @ (away * weights[:, None]) + C @ motion_covariance @ C.T
     return mean, 0.5 * (covariance + covariance.T)

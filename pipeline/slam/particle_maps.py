@@ -8,14 +8,13 @@ blocks out of reach without a test of their landmarks.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.geometry.hash_grid import Cells, holds_unseen
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled_borrowing
+from pipeline.jit import compiled, compiled_borrowing
 from pipeline.types.records import Bool, Float32, Int, Int32
 
 ROOM = 16  # landmarks per block; landmarks with successive births are near each other
@@ -195,33 +194,50 @@ def is_sound(maps: Maps, particles: int) -> bool:
     )
 
 
-def map_of(maps: Maps, p: int) -> MapColumns:
-    """Return copies of the landmarks of particle p. Unused places (hits 0) are skipped; the order is that of
-    the places."""
-    places = int(maps.places[p])
-    block = maps.block[p, : -(-places // ROOM)]
-    used = (maps.hits[block].ravel() > 0) & (np.arange(len(block) * ROOM) < places)
-    return MapColumns(*(_places_of(getattr(maps, name), block)[used] for name in MapColumns._fields))
+@compiled
+def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
+    """Return copies of the landmarks of particle p: the columns of `MapColumns`. Unused places (hits 0) are
+    skipped; the order is that of the places."""
+    places = maps.places[p]
+    mean, covariance = np.empty((places, 2)), np.empty((places, 3))
+    hits, score = np.empty(places, np.int32), np.empty(places, np.float32)
+    birth = np.empty(places, np.int64)
+    n = 0
+    for i in range(places):
+        b, o = maps.block[p, i // ROOM], i % ROOM
+        if maps.hits[b, o] > 0:
+            mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+            for a in range(3):
+                covariance[n, a] = maps.covariance[b, o, a]
+            hits[n], score[n], birth[n] = maps.hits[b, o], maps.score[b, o], maps.birth[b, o]
+            n += 1
+    return mean[:n], covariance[:n], hits[:n], score[:n], birth[:n]
 
 
-def _places_of(column: NDArray[Any], block: Int32) -> NDArray[Any]:
-    """Return a copy of the rows of all places of some blocks, shape (K ROOM, ...), of a column of Maps."""
-    rows = column[block]
-    return rows.reshape(len(block) * ROOM, *rows.shape[2:])
-
-
+@compiled
 def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32, Int]:
     """Return the landmarks of particle p within `reach` [m] of x, y [m]: positions, shape (L, 2) [m];
     covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, and birth numbers, int64, shape (L,). The
     distance must be smaller than `reach`; the arrays are copies, in the order of the places."""
-    places = int(maps.places[p])
-    block = maps.block[p, : -(-places // ROOM)]
-    mean = _places_of(maps.mean, block)
-    away = mean - (x, y)
-    near = (away * away).sum(axis=1) < reach * reach
-    near &= (maps.hits[block].ravel() > 0) & (np.arange(len(mean)) < places)
-    covariance, hits = _places_of(maps.covariance, block)[near], _places_of(maps.hits, block)[near]
-    return mean[near], covariance, hits, _places_of(maps.birth, block)[near]
+    places = maps.places[p]
+    mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
+    birth = np.empty(places, np.int64)
+    n = 0
+    for k in range((maps.places[p] + ROOM - 1) // ROOM):
+        b = maps.block[p, k]
+        dx = max(maps.box[b, 0] - x, 0.0, x - maps.box[b, 2])
+        dy = max(maps.box[b, 1] - y, 0.0, y - maps.box[b, 3])
+        if not dx * dx + dy * dy < reach * reach:
+            continue
+        for o in range(min(ROOM, maps.places[p] - k * ROOM)):
+            dx, dy = maps.mean[b, o, 0] - x, maps.mean[b, o, 1] - y
+            if maps.hits[b, o] > 0 and dx * dx + dy * dy < reach * reach:
+                mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+                for a in range(3):
+                    covariance[n, a] = maps.covariance[b, o, a]
+                hits[n], birth[n] = maps.hits[b, o], maps.birth[b, o]
+                n += 1
+    return mean[:n], covariance[:n], hits[:n], birth[:n]
 
 
 def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[Int32, Int32, int]:

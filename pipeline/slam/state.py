@@ -99,7 +99,7 @@ class SlamState:
 
     def map_of(self, particle: int) -> MapColumns:
         """Return a copy of the landmarks of one particle. Removed landmarks are not among them."""
-        return map_of(self.maps, particle)
+        return MapColumns(*map_of(self.maps, particle))
 
     def copy(self) -> SlamState:
         """Return an independent copy, without unused capacity. Immutable parts (ancestry, graph, places,

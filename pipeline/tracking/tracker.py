@@ -324,10 +324,11 @@ def follow(
     order = np.argsort(birth)
     at = np.minimum(np.searchsorted(birth[order], tracks.landmark), L - 1)
     found = birth[order[at]] == tracks.landmark if L else np.zeros(T, np.bool_)
-    has, first = np.unique(at[found], return_index=True)
     owner, landmark_of, before = np.full(L, -1), np.full(T, -1), tracks.landmark.copy()
-    owner[order[has]] = np.flatnonzero(found)[first]
-    landmark_of[owner[order[has]]] = order[has]
+    rows = np.flatnonzero(found)[::-1]  # the lowest row last, which remains
+    owner[order[at[rows]]] = rows
+    held = np.flatnonzero(owner >= 0)
+    landmark_of[owner[held]] = held
     kept = np.ones(T, np.bool_)
     lost = np.flatnonzero(landmark_of < 0)
     if len(lost) and L:
@@ -446,14 +447,20 @@ def merge_near(tracks: TrackTable, seen: Int, radius: float) -> Bool:
         Which tracks remain, shape (T,); the caller removes the others.
     """
     kept = np.ones(len(tracks), np.bool_)
-    x = tracks.x[:, :2]
-    if np.count_nonzero(_square(x[seen, None], x) < radius * radius) == len(seen):
+    x = tracks.x
+    if len(_pairs_near(x[seen], x, radius)[0]) == len(seen):
         return kept  # each track is near itself only
     for s in seen.tolist():
-        for t in range(len(kept)):
-            if t != s and kept[s] and kept[t] and _square(x[t], x[s]) < radius * radius:
-                join(tracks, min(s, t), max(s, t))
-                kept[max(s, t)] = False
+        t = 0
+        while kept[s]:
+            _, near = _pairs_near(x[s : s + 1], x[t:], radius)
+            near = near[kept[t + near] & (t + near != s)]
+            if not len(near):
+                break
+            t += int(near[0])
+            join(tracks, min(s, t), max(s, t))  # may move the track
+            kept[max(s, t)] = False
+            t += 1
     return kept
 
 
@@ -466,15 +473,18 @@ def are_separate(position: Float, x: Float, radius: float) -> Bool:
         x: States of the tracks, x, y [m] first, shape (T, 4).
         radius: Minimum distance [m].
     """
-    near = _square(position[:, None], x[:, :2]) < radius * radius
-    apart: Bool = np.count_nonzero(near, axis=1) == 0
-    for k in range(1, len(position)):
-        apart[k] &= not (apart[:k] & (_square(position[:k], position[k]) < radius * radius)).any()
+    apart = np.ones(len(position), np.bool_)
+    apart[_pairs_near(position, x, radius)[0]] = False
+    for first, second in zip(*_pairs_near(position, position, radius), strict=True):
+        if first < second and apart[first]:
+            apart[second] = False
     return apart
 
 
-def _square(a: Float, b: Float) -> Float:
-    """Return the squared distances of positions, x, y in the last axis [m^2]; shapes are broadcast."""
-    away = a - b
-    square: Float = np.einsum("...i,...i->...", away, away)
-    return square
+def _pairs_near(a: Float, b: Float, radius: float) -> tuple[Int, Int]:
+    """Return the pairs of rows of two tables, x, y [m] first, that are nearer than a radius [m], sorted: rows
+    of `a` and of `b`, int64, shape (K,) each."""
+    first, second = np.nonzero(np.abs(a[:, None, 0] - b[:, 0]) < radius)
+    away = a[first, :2] - b[second, :2]
+    near = away[:, 0] ** 2 + away[:, 1] ** 2 < radius * radius
+    return first[near], second[near]
