@@ -52,9 +52,10 @@ def is_compiled() -> bool:
     """Return whether the kernels of both programs are cached for the current sources, by the kernel that each
     program compiles last."""
     from pipeline.jit import is_kept
-    from pipeline.tracking.track_classification import classify_new, nearest_other
+    from pipeline.remapping.preview import grouped
+    from pipeline.tracking.track_classification import classify_new
 
-    return is_kept(nearest_other) and is_kept(classify_new)
+    return is_kept(grouped) and is_kept(classify_new)
 
 
 def compiled_share() -> float:

@@ -21,6 +21,7 @@ from pipeline.classification.voxel_map import (
     corrected_voxels,
 )
 from pipeline.config.stages import Classification as Classification
+from pipeline.geometry.hash_grid import nearest_other
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
@@ -365,7 +366,7 @@ class ColumnClassifier:
         n = len(axes[0])
         for name in (*VISIBILITY, "figures", "share", "verdict"):
             getattr(fresh, name)[:n] = getattr(old, name)[kept]
-        nearest = _nearest_before(old.axis, fresh.axis, n)
+        nearest = nearest_other(fresh.axis[n:], old.axis, SAME)
         again = np.flatnonzero(nearest >= 0)
         for name in VISIBILITY:
             getattr(fresh, name)[n + again] = getattr(old, name)[nearest[again]]
@@ -445,19 +446,3 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
             kept[n, 2] = height[i]
             n += 1
     return kept[:n].copy()
-
-
-def _nearest_before(old: Float, axis: Float, first: int) -> Int:
-    """Return for each column from row `first` of `axis` onwards the row of the nearest column of `old` within
-    SAME (exclusive, at 1.3 m), -1 for none; int64, shape (K - first,).
-
-    Args:
-        old: Axes of earlier columns, shape (M, 5).
-        axis: Axes of all columns, shape (K, 5).
-        first: First row to search for.
-    """
-    dx, dy = np.moveaxis(axis[first:, None, :2] - old[:, :2], 2, 0)
-    square = dx * dx + dy * dy
-    if not len(old):
-        return np.full(len(square), -1)
-    return np.where(square.min(axis=1) < SAME * SAME, square.argmin(axis=1), -1)

@@ -6,7 +6,6 @@ matrices are slower.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -92,6 +91,7 @@ def expected_spread(
     )
 
 
+@compiled
 def in_map(
     centre: Float, covariance: Float, pose: Float, pose_covariance: Float
 ) -> tuple[Float, Float, Float]:
@@ -104,10 +104,20 @@ def in_map(
         pose: x, y [m], yaw [rad] of the base in the map, shape (3,).
         pose_covariance: Covariance Sigma of the pose, shape (3, 3).
     """
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    C = np.array([[c, -s], [s, c]])
-    ahead = centre @ C.T
-    return ahead + pose[:2], C @ covariance @ C.T, _by_pose(ahead, pose_covariance)
+    D = centre.shape[0]
+    place, own, added = np.empty((D, 2)), np.empty((D, 2, 2)), np.empty((D, 2, 2))
+    c, s, S = np.cos(pose[2]), np.sin(pose[2]), pose_covariance
+    for d in range(D):
+        x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
+        place[d, 0], place[d, 1] = pose[0] + x, pose[1] + y
+        a, b, e = covariance[d, 0, 0], covariance[d, 0, 1], covariance[d, 1, 1]
+        own[d, 0, 0] = c * c * a - 2.0 * c * s * b + s * s * e
+        own[d, 0, 1] = own[d, 1, 0] = c * s * (a - e) + (c * c - s * s) * b
+        own[d, 1, 1] = s * s * a + 2.0 * c * s * b + c * c * e
+        added[d, 0, 0] = S[0, 0] - 2.0 * y * S[0, 2] + y * y * S[2, 2]
+        added[d, 0, 1] = added[d, 1, 0] = S[0, 1] + x * S[0, 2] - y * S[1, 2] - x * y * S[2, 2]
+        added[d, 1, 1] = S[1, 1] + 2.0 * x * S[1, 2] + x * x * S[2, 2]
+    return place, own, added
 
 
 def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
@@ -118,15 +128,9 @@ def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
         pose: Pose x, y [m], yaw [rad] in the map, shape (3,); J is evaluated at the position minus the pose.
         Sigma: Covariance of the pose, shape (3, 3).
     """
-    return _by_pose(position - pose[:2], Sigma)
-
-
-def _by_pose(ahead: Float, Sigma: Float) -> Float:
-    """Return J Sigma J^T, shape (N, 2, 2) [m^2], for positions relative to the pose along the axes of the
-    map, shape (N, 2) [m]: J = [[1, 0, -y], [0, 1, x]]."""
-    J = np.zeros((len(ahead), 2, 3))
+    J = np.zeros((len(position), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, 0, 2], J[:, 1, 2] = -ahead[:, 1], ahead[:, 0]
+    J[:, 0, 2], J[:, 1, 2] = pose[1] - position[:, 1], position[:, 0] - pose[0]
     added: Float = J @ Sigma @ J.transpose(0, 2, 1)
     return added
 

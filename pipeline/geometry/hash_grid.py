@@ -160,6 +160,25 @@ def nearest_in(cells: Cells, mean: Float, x: float, y: float, reach: float, scal
 
 
 @compiled
+def nearest_other(place: Float, other: Float, reach: float) -> Int:
+    """Return for each row of `place` the row of the nearest position in `other` within a reach, int64, shape
+    (N,); -1 for none.
+
+    Args:
+        place: Positions to search from, x, y first, shape (N, 2 or more) [m].
+        other: Other positions, x, y first, shape (M, 2 or more) [m]. The lowest row is returned of equally
+            near ones.
+        reach: Distance [m] above 0; a nearest position at this distance or farther does not count.
+    """
+    nearest = np.empty(place.shape[0], np.int64)
+    cells, scale = cells_for(other.shape[0]), per_metre(reach)
+    fill(cells, other, other.shape[0], scale)
+    for a in range(place.shape[0]):
+        nearest[a] = nearest_in(cells, other, place[a, 0], place[a, 1], reach, scale)
+    return nearest
+
+
+@compiled
 def group_rows(label: Int | Int32, groups: int) -> tuple[Int, Int]:
     """Sort rows by their group; rows with a negative label are left out.
 

@@ -23,11 +23,11 @@ from pipeline.config.stages import Detection
 from pipeline.detection.verdicts import classify_clusters
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.columns import GrowingColumns
-from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
+from pipeline.geometry.hash_grid import cells_for, nearest_in, nearest_other, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.remapping.rerun import SEGMENTATION_STAGES
-from pipeline.tracking.track_classification import REACH, nearest_other, tree_columns
+from pipeline.tracking.track_classification import REACH, tree_columns
 from pipeline.types.records import Bool, Clusters, Columns, Frame, Int, Path, Trees, Verdict
 
 MOST_PLACES = 20_000
@@ -150,7 +150,7 @@ class ClusterTable:
         return verdict
 
     def places(self, path: Float, p: Parameters) -> tuple[Float, Int]:
-        """Group the clusters with the verdict TREE by their position in the map, see `_grouped`. Return the
+        """Group the clusters with the verdict TREE by their position in the map, see `grouped`. Return the
         mean position x, y of each of T groups, shape (T, 2) [m], and its number of clusters, int64, shape
         (T,). Scans of a lost robot are omitted; at most MOST_PLACES groups are returned.
 
@@ -162,7 +162,7 @@ class ClusterTable:
         tree = self.verdicts(p.detection) == Verdict.TREE
         tree &= ~np.repeat(np.array(self._lost, np.bool_), np.diff(start))
         pose = np.concatenate([path, np.array(self._offsets).reshape(-1, 2)], axis=1)
-        return _grouped(self._columns()["centre"], tree, start, pose, _reach(p), MOST_PLACES)
+        return grouped(self._columns()["centre"], tree, start, pose, _reach(p), MOST_PLACES)
 
     def _columns(self) -> dict[str, Any]:
         """Return a dict from the names in JUDGED_COLUMNS to the values of the stored clusters, views that
@@ -391,9 +391,7 @@ def _trees(known: _Places) -> Trees:
 
 
 @compiled
-def _grouped(
-    centre: Float, tree: Bool, start: Int, pose: Float, reach: float, most: int
-) -> tuple[Float, Int]:
+def grouped(centre: Float, tree: Bool, start: Int, pose: Float, reach: float, most: int) -> tuple[Float, Int]:
     """Group the clusters that are trees, in their order: each joins the group whose mean position is nearest
     and within `reach`, or begins a group. Return the mean position x, y of each of T groups in the map, shape
     (T, 2) [m], and its number of clusters, int64, shape (T,).

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.config.stages import Slam
-from pipeline.geometry.poses import Float, Pose2, wrap_angle
+from pipeline.geometry.poses import Float, Pose2
 from pipeline.jit import compiled
 from pipeline.types.records import PoseMeasurement
 
@@ -276,6 +276,7 @@ def inverted(S: Float) -> tuple[Float, float]:
     return inverse, det
 
 
+@compiled
 def moved_poses(pose: Float, motion: Float) -> Float:
     """Return poses after one common motion, T_map_after = T_map_pose T_motion for each row, shape (P, 3),
     with yaw in [-pi, pi).
@@ -284,11 +285,13 @@ def moved_poses(pose: Float, motion: Float) -> Float:
         pose: x, y [m], yaw [rad] of each pose, shape (P, 3).
         motion: x, y [m], yaw [rad] in the frame of each pose, shape (3,).
     """
-    c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    x, y, yaw = motion.tolist()
-    return np.column_stack(
-        [pose[:, 0] + c * x - s * y, pose[:, 1] + s * x + c * y, wrap_angle(pose[:, 2] + yaw)]
-    )
+    moved = np.empty_like(pose)
+    for p in range(pose.shape[0]):
+        c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
+        moved[p, 0] = pose[p, 0] + c * motion[0] - s * motion[1]
+        moved[p, 1] = pose[p, 1] + s * motion[0] + c * motion[1]
+        moved[p, 2] = (pose[p, 2] + motion[2] + np.pi) % (2.0 * np.pi) - np.pi
+    return moved
 
 
 def moved_pose(pose: Float, motion: Float) -> Float:
@@ -300,6 +303,7 @@ def moved_pose(pose: Float, motion: Float) -> Float:
     return np.array([x + c * dx - s * dy, y + s * dx + c * dy, wrapped(yaw + turn)])
 
 
+@compiled
 def weighted_pose(
     pose: Float, weights: Float, motion: Float, motion_covariance: Float
 ) -> tuple[Float, Float]:
@@ -316,11 +320,30 @@ def weighted_pose(
         motion: Motion since the poses were sampled, the same for all, shape (3,).
         motion_covariance: Covariance of `motion` in the frame in which it begins, shape (3, 3).
     """
-    x, y, yaw = pose.T
-    mean = np.array([weights @ x, weights @ y, math.atan2(weights @ np.sin(yaw), weights @ np.cos(yaw))])
-    away = pose - mean
-    away[:, 2] = (away[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-    c, s = math.cos(mean[2] - motion[2]), math.sin(mean[2] - motion[2])
+    mean = np.zeros(3)
+    cos, sin = 0.0, 0.0
+    for p in range(pose.shape[0]):
+        mean[0] += weights[p] * pose[p, 0]
+        mean[1] += weights[p] * pose[p, 1]
+        cos += weights[p] * np.cos(pose[p, 2])
+        sin += weights[p] * np.sin(pose[p, 2])
+    mean[2] = np.arctan2(sin, cos)
+    covariance = np.zeros((3, 3))
+    for p in range(pose.shape[0]):
+        dx, dy = pose[p, 0] - mean[0], pose[p, 1] - mean[1]
+        turn = (pose[p, 2] - mean[2] + np.pi) % (2.0 * np.pi) - np.pi
+        covariance[0, 0] += weights[p] * dx * dx
+        covariance[0, 1] += weights[p] * dx * dy
+        covariance[0, 2] += weights[p] * dx * turn
+        covariance[1, 1] += weights[p] * dy * dy
+        covariance[1, 2] += weights[p] * dy * turn
+        covariance[2, 2] += weights[p] * turn * turn
+    c, s = np.cos(mean[2] - motion[2]), np.sin(mean[2] - motion[2])
     C = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    covariance = away.T @ (away * weights[:, None]) + C @ motion_covariance @ C.T
-    return mean, 0.5 * (covariance + covariance.T)
+    for i in range(3):
+        for j in range(i, 3):
+            for a in range(3):
+                for b in range(3):
+                    covariance[i, j] += C[i, a] * motion_covariance[a, b] * C[j, b]
+            covariance[j, i] = covariance[i, j]
+    return mean, covariance

@@ -576,6 +576,7 @@ def use_scan(
     return maps, weights, mean, odometry, births
 
 
+@compiled
 def estimated(
     pose: Float, weights: Float, motion: Float, motion_covariance: Float
 ) -> tuple[Float, Float, Float, float]:
@@ -584,4 +585,4 @@ def estimated(
     that `pose` contains the poses before the motion."""
     particles = moved_poses(pose, motion)
     mean, covariance = weighted_pose(particles, weights, motion, motion_covariance)
-    return particles, mean, covariance, float(1.0 / (weights @ weights))
+    return particles, mean, covariance, 1.0 / (weights * weights).sum()

@@ -16,6 +16,7 @@ from pipeline.config.stages import Classification, Tracking
 from pipeline.geometry.gaussian import in_map, rows_of, spread_by_pose
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
 from pipeline.slam.association import associate
 from pipeline.tracking.kalman import ENGINES, split
 from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
@@ -448,16 +449,16 @@ def merge_near(tracks: TrackTable, seen: Int, radius: float) -> Bool:
     """
     kept = np.ones(len(tracks), np.bool_)
     x = tracks.x
-    if len(_pairs_near(x[seen], x, radius)[0]) == len(seen):
+    if (_count_near(x[seen], x, radius) == 1).all():
         return kept  # each track is near itself only
     for s in seen.tolist():
         t = 0
         while kept[s]:
-            _, near = _pairs_near(x[s : s + 1], x[t:], radius)
-            near = near[kept[t + near] & (t + near != s)]
+            near = np.flatnonzero(kept[t:] & _is_near(x[s, :2], x[t:], radius)) + t
+            near = near[near != s]
             if not len(near):
                 break
-            t += int(near[0])
+            t = int(near[0])
             join(tracks, min(s, t), max(s, t))  # may move the track
             kept[max(s, t)] = False
             t += 1
@@ -473,18 +474,26 @@ def are_separate(position: Float, x: Float, radius: float) -> Bool:
         x: States of the tracks, x, y [m] first, shape (T, 4).
         radius: Minimum distance [m].
     """
-    apart = np.ones(len(position), np.bool_)
-    apart[_pairs_near(position, x, radius)[0]] = False
-    for first, second in zip(*_pairs_near(position, position, radius), strict=True):
-        if first < second and apart[first]:
-            apart[second] = False
+    apart: Bool = _count_near(position, x, radius) == 0
+    for k in range(1, len(position)):
+        apart[k] &= not (apart[:k] & _is_near(position[k], position[:k], radius)).any()
     return apart
 
 
-def _pairs_near(a: Float, b: Float, radius: float) -> tuple[Int, Int]:
-    """Return the pairs of rows of two tables, x, y [m] first, that are nearer than a radius [m], sorted: rows
-    of `a` and of `b`, int64, shape (K,) each."""
-    first, second = np.nonzero(np.abs(a[:, None, 0] - b[:, 0]) < radius)
-    away = a[first, :2] - b[second, :2]
-    near = away[:, 0] ** 2 + away[:, 1] ** 2 < radius * radius
-    return first[near], second[near]
+@compiled
+def _count_near(place: Float, other: Float, radius: float) -> Int:
+    """Return for each row of `place` the number of rows of `other` that are nearer than a radius [m], int64,
+    shape (K,); x, y [m] are the first two columns of both."""
+    counts = np.zeros(place.shape[0], np.int64)
+    for i in range(place.shape[0]):
+        for j in range(other.shape[0]):
+            dx, dy = place[i, 0] - other[j, 0], place[i, 1] - other[j, 1]
+            counts[i] += dx * dx + dy * dy < radius * radius
+    return counts
+
+
+def _is_near(place: Float, other: Float, radius: float) -> Bool:
+    """Return which rows of `other` are nearer than a radius [m] to a position x, y [m], shape (M,)."""
+    away = other[:, :2] - place
+    near: Bool = away[:, 0] ** 2 + away[:, 1] ** 2 < radius * radius
+    return near

@@ -11,6 +11,7 @@ from pipeline.classification.column_classifier import SAME
 from pipeline.classification.voxel_map import TILE
 from pipeline.config import Parameters
 from pipeline.geometry.gaussian import spread_by_pose
+from pipeline.geometry.hash_grid import nearest_other
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.ground.terrain_map import PackedHeightMap, merged_terrain
 from pipeline.io.checkpoints.saved_map import SavedMap
@@ -22,7 +23,6 @@ from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
 from pipeline.slam.places import Places
 from pipeline.tracking.observation import SECTORS
-from pipeline.tracking.track_classification import nearest_other
 from pipeline.tracking.track_table import NO_LANDMARK, TrackTable, join
 from pipeline.types.records import Columns, Int, Verdict
 

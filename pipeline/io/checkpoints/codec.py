@@ -252,8 +252,8 @@ def _array(scalar: Any, tree: Any, blob: _Block, name: str) -> np.ndarray[Any, A
         ValueError: The array has another type, no valid shape (1 to 8 dimensions), or is not inside of the
             block.
     """
-    dtype = np.dtype(scalar)
-    if not isinstance(tree, dict) or tree.get("dtype") != dtype.newbyteorder("<").str:
+    dtype, stored = _dtypes(scalar)
+    if not isinstance(tree, dict) or tree.get("dtype") != stored.str:
         raise ValueError(f"{name} is not an array of {dtype}")
     shape: Any = tree.get("shape")
     at: Any = tree.get("at")
@@ -262,13 +262,17 @@ def _array(scalar: Any, tree: Any, blob: _Block, name: str) -> np.ndarray[Any, A
     count = math.prod(shape)
     if len(shape) > 8 or at + count * dtype.itemsize > len(blob.raw):
         raise ValueError(f"{name} is not inside of the block of arrays")
-    flat: np.ndarray[Any, Any]
     if blob.planes:
         raw = np.frombuffer(blob.raw, np.uint8, count * dtype.itemsize, at).reshape(dtype.itemsize, count)
-        flat = np.ascontiguousarray(raw.T).view(dtype.newbyteorder("<"))
-    else:
-        flat = np.frombuffer(blob.raw, dtype.newbyteorder("<"), count, at)
-    return flat.reshape(shape).astype(dtype)
+        return raw.T.copy().view(stored).reshape(shape).astype(dtype, copy=False)
+    return np.frombuffer(blob.raw, stored, count, at).reshape(shape).astype(dtype)
+
+
+@cache
+def _dtypes(scalar: Any) -> tuple[np.dtype[Any], np.dtype[Any]]:  # noqa: ANN401
+    """Return the data type of elements in memory, and in a block."""
+    dtype = np.dtype(scalar)
+    return dtype, dtype.newbyteorder("<")
 
 
 TREE, ARRAYS = "tree.json", "arrays.bin"

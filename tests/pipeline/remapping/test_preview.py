@@ -14,7 +14,7 @@ from pipeline.remapping.preview import (
     SAMPLE_BYTES,
     SAMPLE_SCANS,
     ClusterTable,
-    _grouped,
+    grouped,
     preview_trees,
     sample_scans,
 )
@@ -117,7 +117,7 @@ def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
         elif len(place) < most:
             place.append(x)
             hits.append(1)
-    found, times = _grouped(centre, tree, np.array([0, 100, 300]), np.zeros((2, 5)), reach, most)
+    found, times = grouped(centre, tree, np.array([0, 100, 300]), np.zeros((2, 5)), reach, most)
     assert times.tolist() == hits
     assert found == pytest.approx(np.array(place), abs=1e-9)
 
