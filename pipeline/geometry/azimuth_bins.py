@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import Int
+
+Int = NDArray[np.int64]
 
 
 @compiled
