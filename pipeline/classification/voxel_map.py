@@ -10,6 +10,7 @@ import math
 import mmap
 import sys
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +81,9 @@ class _Tables(NamedTuple):
     tile_first: Int32
     tile_returns: Int
     tile_judged: Int
+
+
+_columns_of = attrgetter(*_Tables._fields)
 
 
 @dataclass(slots=True, eq=False)
@@ -197,7 +201,7 @@ class VoxelMap:
 
     def _tables(self) -> _Tables:
         """Return the columns for the kernels; they share their memory with this map."""
-        return _Tables(*(getattr(self, name) for name in _Tables._fields))
+        return _Tables(*_columns_of(self))
 
     def _make_room(self, most: int) -> None:
         """Make room in the table that is full, in place.

@@ -192,21 +192,24 @@ def accumulated(
         least `update_distance` for a step with slack, distrust or a measured pose. None if the step is zero
         and has none of these.
     """
-    step = motion.step
-    own = np.array(motion.slack) + distrust * motion.period * np.array(DISTRUST)
-    if motion.turn_sigma is not None:
-        own[1] = motion.slack[1]  # slipping wheels do not affect a gyroscope
-    news = motion.measured is not None or bool(own.any())
+    step, doubted_s = motion.step, distrust * motion.period
+    own, own_yaw = motion.slack[0] + doubted_s * DISTRUST[0], motion.slack[1]
+    if motion.turn_sigma is None:
+        own_yaw += doubted_s * DISTRUST[1]  # slipping wheels do not affect a gyroscope
+    news = motion.measured is not None or own != 0.0 or own_yaw != 0.0
     if step.x == 0.0 and step.y == 0.0 and step.yaw == 0.0 and not news:
         return None
+    noise = step_covariance(motion, noise_of(p))
     # A slack is the error of an unknown velocity, which is the same in successive steps: standard deviations
     # add up, and the variance grows with the square of the time, however many scans there are.
-    total = np.minimum(slack + own, SLACK_MAX)
-    noise = step_covariance(motion, noise_of(p))
-    noise[[0, 1, 2], [0, 1, 2]] += (total * total - slack * slack)[[0, 0, 1]]
+    before_xy, before_yaw = slack.tolist()
+    total, total_yaw = min(before_xy + own, SLACK_MAX[0]), min(before_yaw + own_yaw, SLACK_MAX[1])
+    noise[0, 0] += total**2 - before_xy**2
+    noise[1, 1] += total**2 - before_xy**2
+    noise[2, 2] += total_yaw**2 - before_yaw**2
     moved, spread = compounded(before, covariance, step.x, step.y, step.yaw, noise)
     driven = math.hypot(step.x, step.y) + TURN_AS_DISTANCE * abs(wrapped(step.yaw))
-    return moved, spread, total, max(driven, p.update_distance) if news else driven
+    return moved, spread, np.array([total, total_yaw]), max(driven, p.update_distance) if news else driven
 
 
 def step_covariance(motion: Motion, noise: Noise) -> Float:
@@ -214,7 +217,7 @@ def step_covariance(motion: Motion, noise: Noise) -> Float:
     else by the noise of the odometry (`step_variances`); a gyroscope replaces the part of the heading."""
     if motion.covariance is None:
         position, heading = step_variances(motion.step.x, motion.step.y, motion.step.yaw, noise)
-        covariance = np.diag([position, position, heading])
+        covariance = np.array([[position, 0.0, 0.0], [0.0, position, 0.0], [0.0, 0.0, heading]])
     else:
         covariance = motion.covariance.copy()
     if motion.turn_sigma is not None:

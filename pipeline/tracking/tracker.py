@@ -419,9 +419,12 @@ def take_better_landmarks(
         score: Scores of the landmarks, hits minus misses, shape (L,).
         radius: Distance below which a detection belongs to a track [m].
     """
+    free = np.flatnonzero((row < 0) & (births != NO_LANDMARK)).tolist()
+    if not free:
+        return
     detected = np.zeros(len(tracks), np.bool_)
     detected[row[row >= 0]] = True
-    for d in np.flatnonzero((row < 0) & (births != NO_LANDMARK)).tolist():
+    for d in free:
         away = ((tracks.x[:, :2] - position[d]) ** 2).sum(axis=1)
         nearest = int(away.argmin()) if len(tracks) else -1
         if nearest < 0 or away[nearest] >= radius * radius or detected[nearest]:

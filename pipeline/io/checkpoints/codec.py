@@ -172,7 +172,7 @@ def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN
     """
     origin, of = _origin_and_args(kind)
     if origin is np.ndarray:
-        return _array(get_args(of[1])[0], tree, blob, name)
+        return _array(_origin_and_args(of[1])[1][0], tree, blob, name)
     if origin in (Union, types.UnionType):
         if tree is None and type(None) in of:
             return None
