@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
 from app.scene.nodes import (
     MOST_LABELS,
+    OWN_TREE,
     Batch,
     Circles,
     CloudNode,
@@ -22,8 +24,10 @@ from app.scene.nodes import (
     LabelNodes,
     Place,
     Segments,
+    scan_in_map,
 )
 from pipeline.config.stages import Evaluation
+from pipeline.evaluation import match
 from pipeline.geometry.columns import GrowingColumns, rows_of
 from pipeline.types.records import HIDDEN, Frame, HeightMap, Trees, TruthTrees
 
@@ -53,6 +57,7 @@ class MapNodes:
         self._mark = Circles(scene, "/world/selection", 0.06, 5.0)
         self._labels = LabelNodes(scene, "/world/numbers", 1.0)
         self._numbers: list[int] = []
+        self._foot: Float = np.zeros(0)
         self._drawn: tuple[TruthTrees | None, HeightMap | None] = (None, None)  # ground truth and ground
         self.labelled: list[Place] = []
 
@@ -62,7 +67,9 @@ class MapNodes:
             if event.instance_index is not None and 0 <= event.instance_index < len(numbers):
                 on_tree(numbers[event.instance_index])
 
-    def show(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
+    def show(
+        self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings, feet: TreeFeet
+    ) -> None:
         """Show the map after a scan. Trees that move by less than a centimetre are not sent again;
         unconfirmed trees are not shown. Trees have labels if the layers of trees and labels are on;
         `labelled` has their positions afterwards.
@@ -72,13 +79,14 @@ class MapNodes:
             selected: Number of the selected tree, or None.
             ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
             view: Visible layers.
+            feet: Heights of the lowest points of the trees.
         """
         self.ground.show(view.layers["ground"], frame.ground)
         trees, pose = rows_of(frame.trees, frame.trees.confirmed), frame.estimate.T_map_base
-        foot = self.ground.heights(trees.position, frame.base_z)
-        self._numbers = trees.number.tolist()
+        foot = feet.heights(frame, trees, self.ground)
+        self._numbers, self._foot = trees.number.tolist(), foot
         self._show_trees(trees, np.round(foot, 1), frame.of_drive, view)
-        self._show_mark(trees, selected, ring, frame.base_z)
+        self._show_mark(trees, foot, selected, ring, frame.base_z)
         robot = np.array([pose.x, pose.y])
         named = view.layers["trees"] and view.layers["labels"]
         labels = tree_labels(trees, robot, selected, foot) if named else []
@@ -87,15 +95,15 @@ class MapNodes:
 
     def place_of(self, frame: Frame, tree: int | None, ring: Ring) -> tuple[float, float, float] | None:
         """Return x, y and height of the ground [m] in the map of the selected cluster (`ring`), else of the
-        selected tree. None if there is no `ring` and `tree` is no confirmed tree of the frame. Arguments as
-        in `show`."""
-        places = frame.trees.position[frame.trees.confirmed & (frame.trees.number == tree)]
+        selected tree. None if there is no `ring` and `tree` is no confirmed tree of the frame, which is the
+        shown one. Other arguments as in `show`."""
         if ring is not None:
-            places = np.array([ring[:2]])
-        if not len(places):
+            return *ring[:2], float(self.ground.heights(np.array([ring[:2]]), frame.base_z)[0])
+        if tree is None or tree not in self._numbers:
             return None
-        z = self.ground.heights(places[:1], frame.base_z)
-        return float(places[0, 0]), float(places[0, 1]), float(z[0])
+        row = self._numbers.index(tree)
+        x, y = frame.trees.position[frame.trees.confirmed][row].tolist()
+        return x, y, float(self._foot[row])
 
     def show_truth(self, trees: TruthTrees | None, view: ViewSettings) -> None:
         """Show rings at the objects of the ground truth, on the known ground, 12 cm outside their trunks;
@@ -142,25 +150,90 @@ class MapNodes:
         on = view.layers["fits"] and not of_drive
         self._circles.show_at(on, place[measured], radius[measured], each[measured], foot[measured])
 
-    def _show_mark(self, trees: Trees, selected: int | None, ring: Ring, base_z: float) -> None:
+    def _show_mark(self, trees: Trees, foot: Float, selected: int | None, ring: Ring, base_z: float) -> None:
         """Show the ring of the selected cluster or, without one, a ring around the selected tree; none
         without a selection.
 
         Args:
             trees: Confirmed trees.
+            foot: Height of the ground at each of them, shape (T,) [m].
             selected: Number of the selected tree, or None.
             ring: x, y and radius of the selected cluster [m], or None.
-            base_z: Height where the ground is unknown [m].
+            base_z: Height of a cluster where the ground is unknown [m].
         """
         # Around a cluster there is its own ring; a second one around its tree would only cover it.
         row = trees.number == (-1 if selected is None or ring is not None else selected)
-        places, radii = np.round(trees.position[row], 2), []
+        places, radii, z = np.round(trees.position[row], 2), [], foot[row]
         for dbh in trees.dbh[row]:
             radii.append(0.4 + (0.5 * dbh if np.isfinite(dbh) else UNKNOWN_RADIUS))
         if ring is not None:
             places, radii = np.vstack([places, ring[:2]]), [*radii, ring[2] + 0.12]
+            z = np.append(z, self.ground.heights(places[-1:], base_z))
         each = np.tile(np.array([colours.SELECTION], dtype=np.uint8), (len(radii), 1))
-        self._mark.show_at(True, places, np.array(radii), each, self.ground.heights(places, base_z))
+        self._mark.show_at(True, places, np.array(radii), each, z)
+
+
+class TreeFeet:
+    """Heights of the feet of trees: that of the terrain, and where none is known there, of the lowest point
+    of the tree in all scans so far: of those in clusters, without any of all points around it."""
+
+    def __init__(self) -> None:
+        # By number of the tree: its place, the height of that point, and whether it is of a cluster.
+        self._lowest: dict[int, tuple[Float, float, bool]] = {}
+
+    def heights(self, frame: Frame, trees: Trees, ground: GroundNode) -> Float:
+        """Return the height of the foot of each tree, shape (T,) [m]; without terrain and points that of the
+        nearest other tree, and that of the base of the robot if no tree has one.
+
+        Args:
+            frame: Results of the scan.
+            trees: Its confirmed trees.
+            ground: Ground with its heights.
+        """
+        foot = ground.heights(trees.position, np.nan)
+        unknown = np.isnan(foot)
+        if unknown.any():
+            foot[unknown] = self._of_points(frame, rows_of(trees, unknown))
+            known = np.isfinite(foot)
+            if not known.any():
+                return np.full(len(foot), frame.base_z)
+            if known.all():
+                return foot
+            from scipy.spatial import cKDTree
+
+            nearest = cKDTree(trees.position[known]).query(trees.position[~known])[1]
+            foot[~known] = foot[known][nearest]
+        return foot
+
+    def _of_points(self, frame: Frame, trees: Trees) -> Float:
+        """Return the height of the lowest point of each tree in this scan and the ones before, shape (T,)
+        [m]; NaN without points."""
+        for row, number in enumerate(trees.number.tolist()):
+            # Another run of the same source numbers its trees anew.
+            place = self._lowest.get(number, (trees.position[row], np.nan, False))[0]
+            if math.dist(place, trees.position[row]) > OWN_TREE:
+                del self._lowest[number]
+        self._take(trees, scan_in_map(frame, frame.filtered[frame.labels >= 0]), clustered=True)
+        never = np.array([number not in self._lowest for number in trees.number.tolist()])
+        if never.any():
+            self._take(rows_of(trees, never), scan_in_map(frame, frame.raw), clustered=False)
+        return np.array([self._lowest.get(number, NO_FOOT)[1] for number in trees.number.tolist()])
+
+    def _take(self, trees: Trees, points: NDArray[np.float32], *, clustered: bool) -> None:
+        """Lower the feet to points in the map, shape (N, 3) [m], that are at most OWN_TREE from a tree."""
+        from scipy.spatial import cKDTree
+
+        distance, row = cKDTree(trees.position).query(points[:, :2], distance_upper_bound=OWN_TREE)
+        near = np.isfinite(distance)
+        low = np.full(len(trees.number), np.inf)
+        np.minimum.at(low, row[near], points[near, 2])
+        for k in np.flatnonzero(np.isfinite(low)).tolist():
+            number, z = int(trees.number[k]), float(low[k])
+            _, before, same = self._lowest.get(number, NO_FOOT)
+            self._lowest[number] = trees.position[k], min(z, before) if same else z, clustered
+
+
+NO_FOOT = (np.zeros(2), np.nan, False)
 
 
 def tree_labels(
@@ -272,16 +345,14 @@ def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> 
             or false; matched trees may be farther away.
         wanted: Distances of a match and of the ground truth from the path.
     """
-    from scipy.spatial import cKDTree
-
-    from pipeline.evaluation import match
-
     true, kind = np.column_stack([truth.x, truth.y]), np.array(truth.kind, np.str_)
     confirmed = np.flatnonzero(trees.confirmed)
     truth_of = match(trees.position[confirmed], true, wanted.match_distance)
     rows, truth_of = confirmed[truth_of >= 0], truth_of[truth_of >= 0]
     is_tree = kind[truth_of] == "tree"
     offsets = np.stack([true[truth_of[is_tree]], trees.position[rows[is_tree]]], axis=1)
+    from scipy.spatial import cKDTree
+
     way = cKDTree(path)
     missed = kind == "tree"
     missed[truth_of] = False

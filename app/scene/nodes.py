@@ -23,6 +23,7 @@ from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Frame, HeightMap
 
 SIDES = 32  # of a circle
+OWN_TREE = 0.5  # m; a cluster this near to a tree is that tree
 
 N = TypeVar("N", bound=viser.SceneNodeHandle)
 Float = NDArray[np.float64]
@@ -442,13 +443,13 @@ class GroundNode(Node[viser.MeshHandle]):
         vertices, faces = self._mesh
         self.update(on and self.faces > 0, vertices=vertices, faces=faces)
 
-    def heights(self, places: NDArray[np.floating], otherwise: float) -> Float:
+    def heights(self, places: NDArray[np.floating], otherwise: float | Float) -> Float:
         """Return the heights of the ground, shape (N,) [m], of the cell at each position without
         interpolation.
 
         Args:
             places: Positions x, y in the map, shape (N, 2) [m].
-            otherwise: Height where the ground is unknown, also outside of the map [m].
+            otherwise: Height where the ground is unknown, also outside of the map, scalar or shape (N,) [m].
         """
         cell = np.floor((np.asarray(places, np.float64).reshape(-1, 2) - self._low) / self._cell)
         inside = np.all((cell >= 0) & (cell < self._raster.shape), axis=1)

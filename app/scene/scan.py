@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import Colours, ViewSettings
-from app.scene.nodes import MOST_LABELS, Batch, CloudNode, Float, Label, LabelNodes, Place
+from app.scene.nodes import MOST_LABELS, OWN_TREE, Batch, CloudNode, Float, Label, LabelNodes, Place
 from app.scene.robot import ROBOT
 from pipeline.evaluation import match
 from pipeline.types.records import Frame, Verdict
@@ -118,8 +118,7 @@ class ScanNodes:
         rows = frame.detections.cluster if frame.of_drive else np.zeros(0, np.int64)
         rows = rows[np.isfinite(frame.clusters.radius[rows])]
         clusters = frame.clusters
-        height = shown_height(clusters.extent[rows, 2])
-        foot = clusters.centroid[rows, 2] - 0.5 * height
+        height, foot = shown_height(clusters.extent[rows, 2]), bases(frame)[rows]
         radius = clusters.radius[rows]
         self._fits.show(
             on,
@@ -139,7 +138,7 @@ class ScanNodes:
         # fmax: an external stem has no extent, and a cluster may have no circle.
         width = np.fmax(0.5 * np.hypot(c.extent[:, 0], c.extent[:, 1]), c.radius)
         radius = np.minimum(np.fmax(width, 0.06), WIDEST_MARKER) + 0.03
-        foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
+        foot = np.column_stack([c.centroid[:, :2], bases(frame) - 0.03])
         low = nodes.scan_in_map(frame, foot).astype(np.float64)
         size = np.column_stack([radius, radius, height])
         if not frame.of_drive:  # candidates without a circle are many
@@ -214,8 +213,20 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
     return colours.of_points(table, frame.labels, colours.FILTERED)
 
 
+def bases(frame: Frame) -> Float:
+    """Return the height of the lower end of the cylinder of each cluster in the level frame of the sensor,
+    shape (K,) [m]: its lowest point; without points, and in a whole cloud, whose candidates are stems with
+    crowns, half the height below the centroid."""
+    clusters = frame.clusters
+    low = np.full(len(clusters.size), np.inf)
+    if frame.of_drive:
+        member = frame.labels >= 0
+        np.minimum.at(low, frame.labels[member], frame.filtered[member, 2])
+    middle = clusters.centroid[:, 2] - 0.5 * shown_height(clusters.extent[:, 2])
+    return np.where(np.isfinite(low), low, middle)
+
+
 STEM_HEIGHT = 2.0  # [m], drawn where no height was measured
-OWN_TREE = 0.5  # m; a cluster this near to a labelled tree is that tree
 
 
 def cluster_labels(

@@ -14,7 +14,7 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene.colours import COLOUR_BY, ViewSettings
-from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
+from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring, TreeFeet
 from app.scene.panel import PanelCommands, SceneCommands, TunePanel
 from app.scene.robot import RobotNodes, WayNode
 from app.scene.scan import ScanNodes, Vector, VoxelNode, extent
@@ -55,7 +55,7 @@ class Scene:
         self._truth: TruthTrees | None = None
         self._selected: int | None = None
         self._ring: Ring = None
-        self._accumulated = Accumulated()
+        self._accumulated, self._feet = Accumulated(), TreeFeet()
         self._build()
 
     @property
@@ -161,7 +161,7 @@ class Scene:
         stay; the cameras return to the size of a robot."""
         self._frame, self._path = None, np.zeros((0, 4))
         self._truth = self._selected = self._ring = None
-        self._accumulated = Accumulated()
+        self._accumulated, self._feet = Accumulated(), TreeFeet()
         self._follower.frame_plot(0.0)  # the new one does not know where the cameras are
         with self._server.atomic():
             self._server.scene.reset()
@@ -245,7 +245,7 @@ class Scene:
             self._grid.visible = frame.of_drive  # its zero is far below or above the plot
             self._follower.show(self._pose, self._base_z, self._view.follow)
             # First, because the other nodes use the heights of its ground.
-            self._map.show(frame, self._selected, self._ring, self._view)
+            self._map.show(frame, self._selected, self._ring, self._view, self._feet)
             self._map.show_truth(self._truth, self._view)
             self._robot.show(frame, self._path, self._view, self._map.ground)
             self._scan.show(frame, self._view, self._map.labelled)

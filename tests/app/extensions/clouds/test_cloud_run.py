@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from msgspec.structs import replace
 
 from app.explain.build import section as at_breast
 from app.extensions.clouds.inventory import PARAMETERS
+from app.scene import Scene
+from app.scene.nodes import scan_in_map
 from app.worker.one_step_run import OneStepRun
 from app.worker.outbox import picture_of
 from app.worker.process import new_session, open_any_or_one_step
@@ -20,6 +23,8 @@ from pipeline.config import preset
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import Frame, Verdict
+from tests.app.scene.feet import bases, on_terrain, path_of, within
+from tests.app.scene.recorder import Recorder
 from tests.pipeline.plots import PLACES, plot, write_las
 
 FOREST = preset("forest")
@@ -122,6 +127,24 @@ def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session
     status = codec.decode(codec.encode(Report(session.status()))[4:])
     assert isinstance(status, Report)
     assert status.status.one_step == session.status().one_step
+
+
+@pytest.mark.parametrize("name", ["pine_plot.laz", "LPine1_demo.laz", "MLS_Clip.laz"])
+async def test_stems_of_a_cloud_begin_on_the_terrain_or_within_their_own_points(
+    name: str, shared_data: Path
+) -> None:
+    opened = new_session()
+    opened.open(Open(str(shared_data / "forest" / name), "auto", 0))
+    opened.set_parameters(FOREST, 1)
+    frame = mapped(opened)
+    scene = Scene(Recorder(), asyncio.get_running_loop())
+    scene.show(frame, path_of(frame))
+    trees, points = bases(scene, "/world/trees"), scan_in_map(frame, frame.filtered)
+    scene.close()
+    opened.close()
+    assert len(trees) > 5
+    right = on_terrain(frame.ground, trees) | within(points, points, trees)
+    assert right.all(), trees[~right]
 
 
 def test_a_parameter_of_the_inventory_maps_the_cloud_again_and_keeps_the_numbers(session: Session) -> None:
