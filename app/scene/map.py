@@ -25,6 +25,7 @@ from app.scene.nodes import (
     Place,
     Segments,
     scan_in_map,
+    short,
 )
 from pipeline.config.stages import Evaluation
 from pipeline.evaluation import match
@@ -262,8 +263,9 @@ def tree_labels(
 
 
 def _tree_text(trees: Trees, row: int, selected: bool) -> str:
-    """Return the label of a tree: "7: 24 cm" or, without a DBH, "7"; of the selected one "tree 7, DBH 24.1
-    cm" or "tree 7, DBH not measured".
+    """Return the label of a tree: number, DBH and eccentricity as in "7: 24 cm, e 3.8", "7: e 3.8" without a
+    DBH, and "7" without both; of the selected one "tree 7, DBH 24.1 cm, e 3.8" or "tree 7, DBH not measured,
+    e 3.8".
 
     Args:
         trees: Trees of the map.
@@ -271,11 +273,15 @@ def _tree_text(trees: Trees, row: int, selected: bool) -> str:
         selected: Whether it is selected.
     """
     number, dbh = int(trees.number[row]), float(trees.dbh[row])
-    if not selected:
-        return f"{number}: {100 * dbh:.0f} cm" if np.isfinite(dbh) else f"{number}"
-    return (
-        f"tree {number}, DBH {100 * dbh:.1f} cm" if np.isfinite(dbh) else f"tree {number}, DBH not measured"
-    )
+    eccentricity = float(trees.eccentricity[row])
+    figures = [] if np.isnan(eccentricity) else [f"e {short(eccentricity)}"]
+    if np.isfinite(dbh):
+        figures.insert(0, f"{100 * dbh:.1f} cm" if selected else f"{100 * dbh:.0f} cm")
+    elif selected:
+        figures.insert(0, "not measured")
+    if selected:
+        return f"tree {number}, DBH {', '.join(figures)}"
+    return f"{number}: {', '.join(figures)}" if figures else f"{number}"
 
 
 TIMES = 10.0  # magnification of position errors, which are centimetres

@@ -270,9 +270,9 @@ class Segments(Node[viser.LineSegmentsHandle]):
             segments: Ends of the segments in the map, shape (S, 2, 3) [m].
             each: One colour, or one for each segment, uint8, shape (S, 3).
         """
-        drawn = colours.of_lines(np.asarray(each, np.uint8))
-        if drawn.ndim > 1:
-            drawn = np.repeat(drawn, 2, axis=0).reshape(-1, 2, 3)
+        # Never one colour for all: viser's client takes that as sRGB, and keeps the colours of single ones.
+        one_each = np.broadcast_to(np.asarray(each, np.uint8), (len(segments), 3))
+        drawn = np.repeat(colours.of_lines(one_each), 2, axis=0).reshape(-1, 2, 3)
         self.update(on and len(segments) > 0, points=segments.astype(np.float32), colors=drawn)
 
 
@@ -302,6 +302,16 @@ class Circles(Segments):
                 height of the constructor above it.
         """
         self.show(on, circles(centres, radii, self._height + ground), np.repeat(each, SIDES, axis=0))
+
+
+def short(value: float) -> str:
+    """Return a number as text: with one decimal below 10, as an integer below 100, and from 100 on with one
+    significant digit; "∞" if it is not finite."""
+    if not np.isfinite(value):
+        return "∞"
+    if value >= 100.0:
+        return f"{float(f'{value:.1g}'):.0f}"
+    return f"{value:.1f}" if value < 10.0 else f"{value:.0f}"
 
 
 MOST_LABELS = 60  # more than 200 halve the frame rate of a browser
@@ -396,7 +406,7 @@ class LineNode:
         """
         segments = polyline(np.column_stack([places, np.broadcast_to(self._height + ground, len(places))]))
         while len(self._chunks) * CHUNK < len(segments):
-            self._chunks.append(Segments(self._scene, f"{self._name}/{len(self._chunks)}", 2.5))
+            self._chunks.append(Segments(self._scene, f"{self._name}/{len(self._chunks)}", 3.5))
         for number, chunk in enumerate(self._chunks):
             chunk.show(on, segments[number * CHUNK : (number + 1) * CHUNK], self._colour)
 

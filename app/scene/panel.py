@@ -20,7 +20,8 @@ from pipeline.errors import StemmapError
 
 Value = float | int | bool | str
 CHANGED = "● "
-MAIN = tuple(spec for spec in field_specs() if spec.main)
+# In the order of the tab Tune of the page: the filters, which are changed least, come last.
+MAIN = tuple(sorted((spec for spec in field_specs() if spec.main), key=lambda spec: spec.stage == "Filters"))
 
 #: Calls a function with arguments on the loop of the server.
 LoopCaller = Callable[..., None]

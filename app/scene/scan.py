@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import Colours, ViewSettings
-from app.scene.nodes import MOST_LABELS, OWN_TREE, Batch, CloudNode, Float, Label, LabelNodes, Place
+from app.scene.nodes import MOST_LABELS, OWN_TREE, Batch, CloudNode, Float, Label, LabelNodes, Place, short
 from app.scene.robot import ROBOT
 from pipeline.evaluation import match
 from pipeline.types.records import Frame, Verdict
@@ -276,23 +276,13 @@ def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
         radius = float(frame.clusters.radius[k])
         return f"{200 * radius:.0f} cm" if np.isfinite(radius) else ""
     eccentricity = float(frame.clusters.eccentricity[k])
-    return verdict if np.isnan(eccentricity) else f"λ1/λ2 {short(eccentricity)}"
+    return verdict if np.isnan(eccentricity) else f"e {short(eccentricity)}"
 
 
 def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the height with which clusters are rendered, shape (K,) [m]: the height, at least 0.2, and
     STEM_HEIGHT for NaN."""
     return np.where(np.isnan(height), STEM_HEIGHT, np.maximum(height, 0.2))
-
-
-def short(value: float) -> str:
-    """Return a number as text: with one decimal below 10, as an integer below 100, and from 100 on with one
-    significant digit; "∞" if it is not finite."""
-    if not np.isfinite(value):
-        return "∞"
-    if value >= 100.0:
-        return f"{float(f'{value:.1g}'):.0f}"
-    return f"{value:.1f}" if value < 10.0 else f"{value:.0f}"
 
 
 MOST_VOXELS = 20_000  # drawn; boxes are slower than points

@@ -179,7 +179,7 @@ class Scene:
         """Start viser with the panel, the keys and empty nodes."""
         self._server = start_server(self.secret)
         gui = self._server.gui
-        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 105, 78))
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 114, 178))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(330)
         self._tune = TunePanel(gui, self._parameters, self._preset, self._tuning, self._call_on_loop)
@@ -303,8 +303,9 @@ class Scene:
 
 WORLD = "/world"  # parent of all nodes; its children are in the frame of the map
 # Positions of a camera relative to the robot [m].
-BEHIND = (-8.0, -4.5, 6.0)
-ABOVE = (0.0, -0.01, 28.0)
+BEHIND = (-13.0, -7.5, 9.5)
+ABOVE = (0.0, -0.01, 52.0)
+FIELD_OF_VIEW = np.deg2rad(45.0)  # vertical [rad]; viser's 75 degrees draws stems at the border askew
 SEEN = 12.0  # width of the area that these cameras show [m]
 
 
@@ -344,6 +345,7 @@ class Follower:
         """Set the camera of browsers that connect later."""
         self._server.initial_camera.position = tuple(self._scale * np.array(BEHIND))
         self._server.initial_camera.look_at = (0.0, 0.0, 0.5)
+        self._server.initial_camera.fov = FIELD_OF_VIEW
 
     def show(self, pose: Pose2, z: float, follow: bool) -> None:
         """Move the world so that the robot is at the origin, if following is on.

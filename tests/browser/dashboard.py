@@ -236,6 +236,8 @@ class Dashboard:
             self.page.evaluate("() => document.querySelector('#scene').contentWindow.location.reload()")
         self._has_scene = True
         self.scene.wait_for_function(HAS_NODE, arg="/world/robot/scan/raw")
+        self.until("() => document.querySelector('.scene.folded')")  # by the page, in a window of this width
+        self.scene.locator("[data-dock-region] [aria-label^=Expand]").click()
 
     def until_scene_is_named(self) -> None:
         """Wait until the page has named the sliders of the scene."""

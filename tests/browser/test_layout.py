@@ -29,24 +29,40 @@ def box(part: Locator) -> dict[str, float]:
     return {name: float(value) for name, value in found.items()}  # type: ignore[arg-type]
 
 
-def test_the_map_has_a_third_of_the_window_and_is_exchanged_with_the_scene(wide: Dashboard):
+def test_the_scene_has_half_of_the_window_and_is_exchanged_with_the_map(wide: Dashboard):
     page = wide.page
     plan, scene = page.locator("#map"), page.locator("section.scene")
-    for width, height in ((WIDTH, HEIGHT), (1280, 720)):
+    for width, height in ((WIDTH, HEIGHT), (1440, 900), (1280, 720)):
         page.set_viewport_size({"width": width, "height": height})
-        assert box(plan)["width"] * box(plan)["height"] >= width * height / 3
+        assert box(scene)["x"] == 0
+        assert box(scene)["width"] * box(scene)["height"] >= 0.5 * width * height
+        assert box(plan)["x"] > box(scene)["width"]
+        assert box(plan)["height"] > 200
     page.set_viewport_size({"width": WIDTH, "height": HEIGHT})
     page.locator("body").press("x")
-    assert box(scene)["x"] == 0
-    assert box(scene)["width"] * box(scene)["height"] >= WIDTH * HEIGHT / 3
-    assert box(plan)["x"] > box(scene)["width"]
-    assert box(plan)["height"] > 200
-    page.locator("#map-exchange").click()
     assert box(plan)["x"] == 0
+    assert box(plan)["width"] * box(plan)["height"] >= WIDTH * HEIGHT / 3
+    page.locator("#map-exchange").click()
+    assert box(scene)["x"] == 0
+
+
+def test_each_layout_has_a_key_that_opens_its_tab(wide: Dashboard):
+    page = wide.page
+    names = page.locator("#layout-names")
+    for key, name, tab in (
+        ("Shift+R", "Results", "scores"),
+        ("Shift+T", "Tune", "tune"),
+        ("Shift+A", "Annotate", "annotate"),
+        ("Shift+M", "Monitor", "trees"),
+    ):
+        page.locator("body").press(key)
+        expect(page.locator(f"#panel-{tab}")).to_be_visible()
+        expect(names).to_have_value(name)
 
 
 def test_edges_are_dragged_and_moved_by_keys_and_are_there_after_a_reload(wide: Dashboard):
     page = wide.page
+    page.locator("body").press("x")  # the map is on the left
     plan, edge = page.locator("section.map"), page.locator("#split-left")
     before, at = box(plan)["width"], box(edge)
     page.mouse.move(at["x"] + 3, at["y"] + 300)
@@ -62,7 +78,7 @@ def test_edges_are_dragged_and_moved_by_keys_and_are_there_after_a_reload(wide: 
     expect(plan).to_be_visible()
     assert box(plan)["width"] == pytest.approx(wanted, abs=6)
     edge.dblclick()
-    assert box(plan)["width"] == pytest.approx(before, abs=1)
+    assert box(plan)["width"] == pytest.approx(0.62 * WIDTH, abs=6)
     for _ in range(60):
         edge.press("ArrowRight")
     assert box(page.locator(".panel:visible"))["width"] > 0.15 * WIDTH, "nothing is pushed out of the window"
@@ -86,7 +102,7 @@ def test_parts_are_collapsed_and_a_layout_is_saved_by_name(wide: Dashboard):
     page.locator("#layout-save").click()
     saved = page.locator("#layout-names")
     expect(saved).to_have_value("only the scene")
-    saved.select_option("Standard")
+    saved.select_option("Monitor")
     expect(plan).to_be_visible()
     expect(panel).to_be_visible()
     page.reload()
@@ -98,7 +114,7 @@ def test_parts_are_collapsed_and_a_layout_is_saved_by_name(wide: Dashboard):
     saved.select_option("only the scene")
     page.locator("#layout-delete").click()
     expect(saved).to_have_value("")
-    saved.select_option("Standard")
+    saved.select_option("Monitor")
 
 
 def test_one_box_is_open_and_escape_or_a_press_elsewhere_closes_it(wide: Dashboard):

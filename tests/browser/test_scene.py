@@ -145,13 +145,60 @@ def test_a_press_on_a_slider_changes_nothing_and_a_drag_is_one_step(dashboard: D
         before = dragged
 
 
-def test_the_panel_of_the_scene_is_closed_while_tune_is_open(dashboard: Dashboard):
-    slider = dashboard.row("Radius eps").get_by_role("slider")
-    expect(slider).to_be_visible()
-    dashboard.tab("Tune")
-    expect(slider).not_to_be_visible()
+@pytest.fixture
+def wide(dashboard: Dashboard) -> Iterator[Dashboard]:
+    """A window with room for the panel of the scene."""
+    size = dashboard.page.viewport_size
     dashboard.tab("Trees")
+    dashboard.page.set_viewport_size({"width": 1640, "height": 720})
+    yield dashboard
+    assert size is not None
+    dashboard.page.set_viewport_size(size)
+
+
+def test_the_panel_of_the_scene_is_open_in_a_wide_window_unless_tune_is(wide: Dashboard):
+    slider = wide.row("Radius eps").get_by_role("slider")
     expect(slider).to_be_visible()
+    wide.tab("Tune")
+    expect(slider).not_to_be_visible()
+    wide.tab("Trees")
+    expect(slider).to_be_visible()
+    wide.page.set_viewport_size({"width": 1500, "height": 720})
+    expect(slider).not_to_be_visible()
+    opened = wide.scene.locator("[data-dock-region] [aria-label^=Expand]")
+    opened.click()  # a person opens it, and it stays open
+    wide.tab("Clusters")
+    expect(slider).to_be_visible()
+
+
+def test_both_panels_have_the_same_parameters_in_the_same_order_and_undo_works_from_both(
+    dashboard: Dashboard,
+):
+    dashboard.until_scene_is_named()
+    labels = [label for label, *_ in dashboard.scene.evaluate(SLIDERS)]
+    dashboard.tab("Tune")
+    own = dashboard.page.locator("[data-stage='Main parameters'] .tune-row label").all_inner_texts()
+    assert len(own) == 12
+    plain = [re.sub(r"[^\w ]", "", label).split() for label in labels]
+    assert plain == [text.replace("●", "").split() for text in own]
+    dashboard.tab("Trees")
+    undo = dashboard.page.locator("#undo")
+    slider = dashboard.row("Radius eps").get_by_role("slider")
+    for back in (undo.click, lambda: slider.press("Control+z")):
+        slider.press("ArrowRight")
+        dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 0.16")
+        expect(undo).to_be_enabled()
+        back()
+        dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 0.15")
+
+
+def test_points_have_a_bounded_size_and_the_view_an_angle_of_45_degrees(dashboard: Dashboard):
+    dashboard.scene.wait_for_function(
+        """() => { const all = [];
+        window.__viserMutable.scene.traverse(node => node.isPoints && all.push(node.material.vertexShader));
+        return all.length > 0 && all.every(text => text.includes("clamp(scale")); }"""
+    )
+    assert dashboard.scene.evaluate("() => window.__viserMutable.camera.fov") == pytest.approx(45.0, abs=0.1)
 
 
 def test_a_preset_is_chosen_in_the_scene(dashboard: Dashboard):
@@ -512,9 +559,8 @@ def test_the_notice_of_software_rendering_closes_by_itself(dashboard: Dashboard)
     )
 
 
-def test_the_panel_leaves_a_small_scene_free(dashboard: Dashboard):
-    page, scene = dashboard.page, dashboard.scene
-    dashboard.tab("Trees")
+def test_the_panel_leaves_a_small_scene_free(wide: Dashboard):
+    page, scene = wide.page, wide.scene
     slider = scene.get_by_role("slider", name="Radius eps").first
     expect(slider).to_be_visible()
     split = page.locator("#split-left")
@@ -522,7 +568,7 @@ def test_the_panel_leaves_a_small_scene_free(dashboard: Dashboard):
     for _ in range(60):
         if page.locator("#scene").evaluate("node => node.clientWidth") < 540:
             break
-        split.press("ArrowRight")
+        split.press("ArrowLeft")
     expect(slider).to_be_hidden()
     split.dblclick()
     expect(slider).to_be_visible()

@@ -78,7 +78,7 @@ def test_a_filter_selects_trees(dashboard: Dashboard):
         f"DBH<{middle}": lambda t: t["dbh_cm"] is not None and t["dbh_cm"] < middle,
         "dbh none": lambda t: t["dbh_cm"] is None,
         f"seen >= {often} x > 0": lambda t: t["observations"] >= often and t["x"] > 0,
-        f"scans >= {often} λ1/λ2 < 6": lambda t: t["observations"] >= often and (t["eccentricity"] or 9) < 6,
+        f"scans >= {often} e < 6": lambda t: t["observations"] >= often and (t["eccentricity"] or 9) < 6,
         "y ..-1": lambda t: t["y"] <= -1,
         "x < \N{MINUS SIGN}1": lambda t: t["x"] < -1,
         "1": lambda t: str(t["number"]).startswith("1"),

@@ -141,3 +141,68 @@ def test_a_set_is_saved_and_shared_as_a_file(dashboard: Dashboard, tmp_path: Pat
     page.locator("#tune-reset").click()
     dashboard.until_server("/api/parameters", "it.changed.length === 0")
     assert dashboard.errors == []
+
+
+IN_VIEW = """() => {
+  const { bottom } = document.querySelector('#panel-tune').getBoundingClientRect();
+  const top = document.querySelector('.tune-top').getBoundingClientRect().bottom;
+  return [...document.querySelectorAll('#panel-tune input[type=range]')]
+    .map(node => node.getBoundingClientRect())
+    .filter(box => box.height > 0 && box.top >= top - 1 && box.bottom <= bottom).length;
+}"""
+
+
+@pytest.mark.parametrize(("width", "height", "least"), [(1440, 900, 12), (1280, 720, 8)])
+def test_sliders_are_in_view_and_none_moves_while_one_is_dragged(
+    dashboard: Dashboard, width: int, height: int, least: int
+):
+    page = dashboard.page
+    before = page.viewport_size
+    assert before is not None
+    page.set_viewport_size({"width": width, "height": height})
+    assert page.evaluate(IN_VIEW) >= least
+    sliders = page.locator("#tune-rows input[type=range]:visible")
+
+    def places() -> list[float]:
+        return [float(y) for y in sliders.evaluate_all("all => all.map(s => s.getBoundingClientRect().y)")]
+
+    at = places()
+    box = page.get_by_role("slider", name="Radius eps, slider").bounding_box()
+    assert box is not None
+    middle = box["y"] + box["height"] / 2
+    page.mouse.move(box["x"] + 0.3 * box["width"], middle)
+    page.mouse.down()
+    for k in range(30):  # the clusters change, and the run is re-mapped
+        page.mouse.move(box["x"] + 0.3 * box["width"] + 4 * k, middle)
+        page.wait_for_timeout(100)
+        assert places() == pytest.approx(at, abs=1.0)
+    page.mouse.up()
+    dashboard.until_server("/api/status", "it.remapped === null")
+    assert places() == pytest.approx(at, abs=1.0)
+    # A refusal covers the row below instead of moving it.
+    lowest = value(page, "detection.e_min")
+    lowest.fill("900")
+    lowest.press("Enter")
+    expect(page.locator("[data-parameter='detection.e_min'] .error")).to_be_visible()
+    assert places() == pytest.approx(at, abs=1.0)
+    lowest.press("Escape")
+    dashboard.errors.clear()
+    page.set_viewport_size(before)
+
+
+def test_a_change_that_does_not_alter_the_map_is_said(dashboard: Dashboard):
+    field = value(dashboard.page, "filters.z_max")
+    field.fill("19.95")
+    field.press("Enter")
+    expect(dashboard.page.locator("#tune-whole-status")).to_contain_text("the same as before")
+
+
+def test_a_limit_in_a_story_leads_to_its_slider(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Clusters")
+    page.locator("#panel-clusters tbody tr").first.click()
+    limit = page.locator("#panel-story .checks button").first
+    title = (limit.get_attribute("title") or "").removeprefix("Go to the slider of ")
+    limit.click()
+    row = page.locator(".tune-row:focus-within label")
+    expect(row).to_contain_text(title)

@@ -60,7 +60,7 @@ function clusterTable() {
     ...[String(k + 1), c.verdict[k], String(c.size[k]), c.eccentricity[k] === null ? "∞" : figure(c.eccentricity[k]),
       figure(c.radius_cm[k]), fixed(c.distance[k], 1)].filter(applies).map((text) => el("td", { text })));
   });
-  const heads = [["cluster", "Number of the cluster in this scan, as in its Story"], ["verdict", "Verdict on this cluster, from this scan only"], ["points", "Number of its points"], ["λ1/λ2", "Eccentricity λ1/λ2"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
+  const heads = [["cluster", "Number of the cluster in this scan, as in its Story"], ["verdict", "Verdict on this cluster, from this scan only"], ["points", "Number of its points"], ["e", "Eccentricity: ratio of the eigenvalues of its covariance"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
   return el("table", { id: "cluster-table", class: "plain" }, el("thead", {}, el("tr", {}, ...heads.filter(applies).map(([text, title]) => el("th", { scope: "col", text, title })))),
     el("tbody", {}, ...rows));
 }

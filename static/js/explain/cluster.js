@@ -6,11 +6,11 @@ import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../cor
 import { isDrive } from "../core/store.js";
 import { verdictOf } from "../core/verdicts.js";
 import { ofExtensions } from "../shell/extensions.js";
+import { openParameter } from "../tune/panel.js";
+import { specOf } from "../tune/parameters.js";
 import { columnFigure } from "./columns.js";
 
 const SIZE = 250; // of the picture
-const NAMES = { eccentricity: "eccentricity λ1/λ2" };
-const named = (check) => NAMES[check.figure] ?? check.figure;
 
 function plain(value, unit) {
   if (value === null) return NONE;
@@ -44,7 +44,7 @@ function why(story) {
 
 export function failureText(failed) {
   const side = failed.relation === "at most" ? "above" : "below";
-  return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${limitOf(failed)}.`;
+  return `Its ${failed.figure} of ${plain(failed.value, failed.unit)} is ${side} ${limitOf(failed)}.`;
 }
 
 function limitOf({ limit, unit, title, parameter }) {
@@ -93,7 +93,7 @@ function axes(story, at) {
 
 function figures(story) {
   const fit = story.circle;
-  const rows = [["points", String(story.size)], ["λ1/λ2", story.eccentricity === null && story.size > 1 ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
+  const rows = [["points", String(story.size)], ["eccentricity e", story.eccentricity === null && story.size > 1 ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
   if (fit) {
     rows.push(["radius", `${plusMinus(100 * fit.radius, 100 * fit.radius_sigma)} cm`], ["diameter", `${plusMinus(200 * fit.radius, 200 * fit.radius_sigma)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
       ["tilt of the axis", `${figure(fit.lean_deg, 2)}°`], ["centre ±", `${figure(100 * fit.ellipse[0], 2)} × ${figure(100 * fit.ellipse[1], 2)} cm`]);
@@ -131,8 +131,8 @@ export function checks(story) {
     const given = noCircle(story, check) ? null : check.value;
     const value = check.relation ? plain(given, check.unit) : check.fails ? "yes" : "no";
     return el("tr", { class: `${check.fails ? "fails" : ""} ${decides ? "decides" : ""}`.trim(), title: check.parameter ? `Limit: ${check.title} (${check.parameter})` : "" },
-      el("td", { text: check.fails ? "✕" : given === null ? "·" : "✓" }), el("td", { text: named(check) }), el("td", { text: value }),
-      el("td", { text: limit }), el("td", { text: check.fails ? check.verdict : "" }));
+      el("td", { text: check.fails ? "✕" : given === null ? "·" : "✓" }), el("td", { text: check.figure }), el("td", { text: value }),
+      el("td", {}, check.parameter && specOf(check.parameter) ? el("button", { class: "link", type: "button", text: limit, title: `Go to the slider of ${check.title}`, onclick: () => openParameter(check.parameter) }) : limit), el("td", { text: check.fails ? check.verdict : "" }));
   });
   return el("figure", {}, el("figcaption", { text: "Checks; the first one that fails decides" }),
     el("table", { class: "checks" }, el("tbody", {}, ...rows)));

@@ -33,7 +33,7 @@ function seen(story) {
 function overview(story, showCluster) {
   const dbh = story.dbh === null ? NONE : `${plusMinus(100 * story.dbh, 100 * story.dbh_sigma)} cm`;
   const rows = [["DBH", dbh], ["covered", `${figure(story.coverage_deg)}° of 360°`], ["x, y", placeText(story.position)],
-    ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["λ1/λ2", figure(story.eccentricity)]];
+    ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["eccentricity e", figure(story.eccentricity)]];
   return el("div", { class: "story-fit" }, covered(story), el("div", {},
     definitions(rows),
     story.dbh === null ? el("p", { class: "dim note", text: missingDbh(story) }) : "",

@@ -5,7 +5,7 @@ import { byId, recall, remember } from "../core/dom.js";
 import { isPlaying, on, state } from "../core/store.js";
 import { onSceneLoad } from "./scene.js";
 
-const NEAR = 7; // [m] largest distance from the selection after a flight
+const NEAR = 12; // [m] largest distance from the selection after a flight
 const HEIGHT = 1.3; // [m] of the place that the camera looks at, above the ground
 const CLICK = 6000; // [ms] after a click in the scene in which a selection counts as its result
 const calm = matchMedia("(prefers-reduced-motion: reduce)");

@@ -2,7 +2,7 @@
 // it names its widgets for screen readers, and collapses it while Tune is open and where it would cover the scene.
 
 import { byId } from "../core/dom.js";
-import { on } from "../core/store.js";
+import { isDrive, on } from "../core/store.js";
 import { newGesture, setValue, tuning, valueOf } from "../tune/parameters.js";
 import { beginDrag, near, pressed } from "../tune/slider.js";
 import { throttled } from "../core/timing.js";
@@ -58,23 +58,25 @@ const nameWidgets = throttled(() => {
   }
 }, NAMING_PAUSE);
 
-const narrow = matchMedia("(max-width: 1180px)"), phone = matchMedia("(max-width: 700px)");
+const narrow = matchMedia("(max-width: 1599px)"), phone = matchMedia("(max-width: 700px)");
 const LEAST_WIDTH = 560; // [px] of the scene with its panel
-// Whether no room is left beside the panel.
-const isCovered = () => phone.matches || (narrow.matches && byId("side").classList.contains("open")) || byId("scene").clientWidth < LEAST_WIDTH;
 
-// viser keeps the panel open or closed in each browser; its button is the only way to change that here.
+// viser keeps the panel open or closed in each browser; its button is the only way to change that here. A person may open or
+// close it at any time: only what the page wants otherwise than before is done.
 function collapse() {
-  const wanted = visible("tune") || isCovered();
+  const wanted = visible("tune") || narrow.matches || !isDrive() || byId("scene").clientWidth < LEAST_WIDTH;
   if (!inner || wanted === collapsed) return;
-  const button = inner.querySelector(`[data-dock-region] [aria-label^="${wanted ? "Collapse" : "Expand"}"]`)
-    ?? inner.querySelector('.mantine-Paper-root [style*="cursor: pointer"][style*="height: 3.5em"]'); // of its sheet on a phone
-  if (!button) return; // not built yet, or a person has done it already
-  button.click();
-  button.blur();
+  const named = (word) => inner.querySelector(`[data-dock-region] [aria-label^="${word}"]`);
+  const sheet = phone.matches && inner.querySelector('.mantine-Paper-root [style*="cursor: pointer"][style*="height: 3.5em"]');
+  const button = sheet || named(wanted ? "Collapse" : "Expand");
+  if (!button && !named(wanted ? "Expand" : "Collapse")) return; // not built yet
+  button?.click();
+  button?.blur();
   collapsed = wanted;
-  document.querySelector(".scene").classList.toggle("folded", wanted); // the veil of a view-only page follows
 }
+
+// What the page shows over the scene leaves the panel free.
+const follow = () => document.querySelector(".scene").classList.toggle("folded", Boolean(phone.matches || inner?.querySelector('[data-dock-region] [aria-label^="Expand"]')));
 
 export function startScenePanel() {
   onSceneLoad((frame) => {
@@ -83,10 +85,9 @@ export function startScenePanel() {
     inner.addEventListener("pointerdown", press, true);
     inner.addEventListener("touchstart", hold, true);
     inner.addEventListener("keydown", key, true);
-    new frame.MutationObserver(() => { nameWidgets(); collapse(); }).observe(inner.body, { childList: true, subtree: true });
+    new frame.MutationObserver(() => { nameWidgets(); collapse(); follow(); }).observe(inner.body, { childList: true, subtree: true });
   });
-  on("tab", collapse);
-  new MutationObserver(collapse).observe(byId("side"), { attributeFilter: ["class"] });
+  on("tab source status", collapse);
   narrow.addEventListener("change", collapse);
   new ResizeObserver(collapse).observe(byId("scene"));
 }

@@ -6,7 +6,8 @@ import { isDark } from "../core/theme.js";
 
 const frame = byId("scene");
 const loaders = [];
-const builders = [drawWorldWithItsContent, closeRenderingNotice];
+const builders = [drawWorldWithItsContent, boundPointSizes, closeRenderingNotice];
+const POINT_PX = [1.5, 8]; // [px] smallest and largest diameter of a point
 const NOTICE_MS = 8000, LOOK_MS = 250, LOOKS = 40;
 
 export const onSceneLoad = (listener) => loaders.push(listener);
@@ -63,6 +64,23 @@ function drawWorldWithItsContent({ __viserMutable: viser }) {
     world.position.copy(drawn);
     world.updateMatrix();
     world.updateMatrixWorld(true);
+  };
+}
+
+// viser draws a point by its size in metres only: near the camera it would be a disc, and far away it would vanish.
+function boundPointSizes({ __viserMutable: { scene } }) {
+  if (scene.userData.hasBounds) return; // the window of a frame is the same object after a reload
+  scene.userData.hasBounds = true;
+  const then = scene.onBeforeRender;
+  scene.onBeforeRender = (...args) => {
+    then?.apply(scene, args);
+    const ends = POINT_PX.map((size) => (size * args[0].getPixelRatio()).toFixed(2)).join(", ");
+    scene.traverse(({ isPoints, material }) => {
+      if (!isPoints || material.userData.isBounded) return;
+      material.userData.isBounded = true;
+      material.vertexShader = material.vertexShader.replace("(scale / -world_pos.z)", `clamp(scale / -world_pos.z, ${ends})`);
+      material.needsUpdate = true;
+    });
   };
 }
 

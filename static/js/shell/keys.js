@@ -7,7 +7,7 @@ import { edits, looksOnly } from "../core/permissions.js";
 import { advance } from "../playback/timeline.js";
 import { toggleLayer } from "../scene/layers.js";
 import { onSceneLoad, pressInScene } from "../scene/scene.js";
-import { tuneKey } from "../tune/parameters.js";
+import { tuneKey, undoKey } from "../tune/parameters.js";
 import { ACTIONS, showSheet } from "./actions.js";
 import { ofExtensions } from "./extensions.js";
 import { openPalette } from "./palette.js";
@@ -39,6 +39,10 @@ function act(event, inScene) {
     return;
   }
   if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || ofExtensions("pressed", event).some(Boolean) || tuneKey(event))) {
+    take();
+    return;
+  }
+  if (inScene && !looksOnly() && !target.matches?.("input, textarea") && undoKey(event)) { // its sliders are parameters in every tab
     take();
     return;
   }

@@ -2,14 +2,20 @@
 
 import { byId, el, recall, remember } from "../core/dom.js";
 import { startPopover } from "../core/popover.js";
+import { on } from "../core/store.js";
+import { openTab, visible } from "./tabs.js";
 
-// left: width of the left part, top: height of the upper right part, both in percent; exchanged: the scene is on the left.
-const STANDARD = { left: 45, top: 55, exchanged: false, map: true, tabs: true };
+// left: width of the left part, top: height of the upper right part, upper: the same while the tab Tune is open, all in percent;
+// exchanged: the scene is on the left.
+const STANDARD = { left: 62, top: 55, upper: 20, exchanged: true, map: true, tabs: true };
+const LARGE_MAP = { left: 45, exchanged: false };
 const BUILT_IN = {
-  Standard: STANDARD,
-  "Large scene": { ...STANDARD, left: 62, exchanged: true },
-  "Long table": { ...STANDARD, top: 25 },
+  Monitor: STANDARD,
+  Tune: STANDARD,
+  Annotate: { ...STANDARD, ...LARGE_MAP, top: 30 },
+  Results: { ...STANDARD, ...LARGE_MAP, top: 25 },
 };
+const TABS = { Monitor: "trees", Tune: "tune", Annotate: "annotate", Results: "scores" };
 const LEAST = 15, MOST = 80; // [%]
 const STEP = 2; // [%] by an arrow key
 const LONGEST_NAME = 40, MOST_SAVED = 20;
@@ -32,23 +38,31 @@ function setLayout(changes) {
   layout = { ...layout, ...changes };
   layout.left = clipped(layout.left);
   layout.top = clipped(layout.top);
+  layout.upper = clipped(layout.upper);
   remember("layout", JSON.stringify(layout));
   show();
 }
 
-export const exchange = () => setLayout({ ...(layout.exchanged ? STANDARD : BUILT_IN["Large scene"]), top: layout.top, tabs: layout.tabs });
+// The height of the upper part that counts now.
+const height = () => (visible("tune") ? "upper" : "top");
+
+export const exchange = () => setLayout({ ...(layout.exchanged ? LARGE_MAP : { left: STANDARD.left, exchanged: true }), map: true });
 export const toggleMap = () => setLayout({ map: !layout.map });
 export const toggleTabs = () => setLayout({ tabs: !layout.tabs });
 export const showTabs = () => layout.tabs || toggleTabs();
-export const standardLayout = () => setLayout(STANDARD);
+export function useLayout(name) {
+  setLayout(all()[name]);
+  if (name in TABS) openTab(TABS[name]);
+  fillNames();
+}
 
 function show() {
   work.style.setProperty("--left", `${layout.left}%`);
-  work.style.setProperty("--top", `${layout.top}%`);
+  work.style.setProperty("--top", `${layout[height()]}%`);
   work.classList.toggle("exchanged", layout.exchanged && layout.map);
   work.classList.toggle("no-map", !layout.map);
   work.classList.toggle("no-tabs", !layout.tabs);
-  for (const [id, value] of [["split-left", layout.left], ["split-top", layout.top]]) byId(id).setAttribute("aria-valuenow", String(Math.round(value)));
+  for (const [id, value] of [["split-left", layout.left], ["split-top", layout[height()]]]) byId(id).setAttribute("aria-valuenow", String(Math.round(value)));
   byId("map-exchange").setAttribute("aria-pressed", String(layout.exchanged));
   byId("layout-map").checked = layout.map;
   byId("layout-tabs").checked = layout.tabs;
@@ -58,7 +72,7 @@ function show() {
 
 function fillNames() {
   const list = byId("layout-names"), names = Object.keys(all());
-  const chosen = names.find((name) => same(all()[name])) ?? "";
+  const chosen = names.find((name) => same(all()[name]) && visible(TABS[name] ?? "")) ?? names.find((name) => same(all()[name]) && !(name in TABS)) ?? "";
   list.replaceChildren(el("option", { value: "", text: "Choose a layout …" }), ...names.map((name) => el("option", { value: name, text: name })));
   list.value = chosen;
   byId("layout-delete").disabled = !(chosen in saved);
@@ -88,16 +102,16 @@ function startSplitter(id, side, keys, percentAt) {
     document.body.classList.add("resizing"); // the frame of the scene would take the pointer
   });
   splitter.addEventListener("pointermove", (event) => {
-    if (splitter.hasPointerCapture(event.pointerId)) setLayout({ [side]: percentAt(event, work.getBoundingClientRect()) });
+    if (splitter.hasPointerCapture(event.pointerId)) setLayout({ [side()]: percentAt(event, work.getBoundingClientRect()) });
   });
   splitter.addEventListener("lostpointercapture", () => document.body.classList.remove("resizing"));
-  splitter.addEventListener("dblclick", () => setLayout({ [side]: STANDARD[side] }));
+  splitter.addEventListener("dblclick", () => setLayout({ [side()]: STANDARD[side()] }));
   splitter.addEventListener("keydown", (event) => {
     const step = keys[event.key];
     if (!step || event.shiftKey) return;
     event.preventDefault();
     event.stopPropagation(); // the arrows would also step the run
-    setLayout({ [side]: layout[side] + step * STEP });
+    setLayout({ [side()]: layout[side()] + step * STEP });
   });
 }
 
@@ -106,7 +120,7 @@ function menu() {
     el("label", {}, el("input", { id: "layout-map", type: "checkbox", onchange: toggleMap }), " 2D map"),
     el("label", {}, el("input", { id: "layout-tabs", type: "checkbox", onchange: toggleTabs }), " Tabs and table"),
     el("button", { class: "small", text: "Exchange map and scene", onclick: exchange }),
-    el("div", { class: "row" }, el("select", { id: "layout-names", "aria-label": "Saved layouts", onchange: (event) => event.target.value && setLayout(all()[event.target.value]) }),
+    el("div", { class: "row" }, el("select", { id: "layout-names", "aria-label": "Saved layouts", onchange: (event) => event.target.value && useLayout(event.target.value) }),
       el("button", { id: "layout-delete", class: "small", text: "Delete", title: "Delete the chosen layout", onclick: drop })),
     el("div", { class: "row" }, el("input", { id: "layout-name", type: "text", maxlength: String(LONGEST_NAME), placeholder: "name", "aria-label": "Name of the layout", autocomplete: "off" }),
       el("button", { id: "layout-save", class: "small", text: "Save", title: "Save this layout under the name", onclick: save })),
@@ -117,8 +131,9 @@ export function startLayout() {
   byId("layout-menu").replaceChildren(...menu());
   startPopover(byId("layout-button"), byId("layout-menu"));
   byId("map-exchange").addEventListener("click", exchange);
-  startSplitter("split-left", "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
-  startSplitter("split-top", "top", { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (event.clientY - box.top)) / box.height);
+  startSplitter("split-left", () => "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
+  startSplitter("split-top", height, { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (event.clientY - box.top)) / box.height);
+  on("tab", show);
   saved = stored("layouts");
   setLayout(stored("layout"));
 }

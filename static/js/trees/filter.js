@@ -4,13 +4,13 @@ import { isReviewed, KINDS, reviewOf, STATES } from "../annotate/annotations.js"
 import { distance, nearest } from "../core/nearest.js";
 import { state } from "../core/store.js";
 
-export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, scans > 50, ± < 5, λ1/λ2 < 10, x -5..5, height > 20 and lean < 5 where they are measured; review state: open, confirmed, rejected, skipped, reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
+export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, scans > 50, ± < 5, e < 10, x -5..5, height > 20 and lean < 5 where they are measured; review state: open, confirmed, rejected, skipped, reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
 
 export const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2)); // of the position [cm]
 
 const COLUMNS = {
   tree: (t) => t.number, x: (t) => t.x, y: (t) => t.y, "±": sigma, sigma, dbh: (t) => t.dbh_cm,
-  "λ1/λ2": (t) => t.eccentricity, e: (t) => t.eccentricity, scans: (t) => t.observations, seen: (t) => t.observations, slices: (t) => t.observations, height: (t) => t.height_m, lean: (t) => t.lean_deg,
+  eccentricity: (t) => t.eccentricity, e: (t) => t.eccentricity, scans: (t) => t.observations, seen: (t) => t.observations, slices: (t) => t.observations, height: (t) => t.height_m, lean: (t) => t.lean_deg,
 };
 const NAMES = Object.keys(COLUMNS).join("|");
 const NUMBER = "[-+]?\\d+(?:\\.\\d+)?";

@@ -31,7 +31,7 @@ const COLUMNS = [
   ["dbh", "DBH cm", "Diameter at breast height ± its standard deviation", (t) => dbh(t), (t) => t.dbh_cm],
   ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or it was not seen", (t) => (t.height_m === null ? NONE : plusMinus(t.height_m, t.sigma_height_m)), (t) => t.height_m, true],
   ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg, true],
-  ["e", "λ1/λ2", "Eccentricity λ1/λ2: the mean over its scans", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
+  ["e", "e", "Eccentricity: ratio of the eigenvalues of the covariance of a cluster, the mean over its scans", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
   ["seen", "scans", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
 ];
 const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");

@@ -13,7 +13,6 @@ import { rowOf } from "./row.js";
 
 const LARGEST_FILE = 100_000;
 const MAIN = "Main parameters";
-const FIRST_STAGES = ["Detection", "Clustering"]; // of the main parameters; those of the last one come first
 const rows = new Map(); // by the parameter's name
 const groups = new Map(); // by the stage; the main parameters have their own group
 let presetValues = {};
@@ -29,8 +28,8 @@ function build() {
     else await takeFile(chosen.name, await chosen.text());
   } });
   const find = el("input", { id: "tune-find", type: "search", placeholder: "Find a parameter", "aria-label": "Find a parameter by name, stage or meaning", autocomplete: "off", oninput: sift });
-  const only = el("input", { id: "tune-only", type: "checkbox", onchange: sift });
-  const main = tuning.specs.filter((spec) => spec.main).sort((a, b) => FIRST_STAGES.indexOf(b.stage) - FIRST_STAGES.indexOf(a.stage));
+  const only = el("input", { id: "tune-only", type: "checkbox", "aria-label": "Changed only", onchange: sift });
+  const main = tuning.specs.filter((spec) => spec.main).sort((a, b) => (a.stage === "Filters") - (b.stage === "Filters")); // as in the panel of the scene
   const others = tuning.specs.filter((spec) => !spec.main);
   const parts = [groupOf(MAIN, main), ...[...new Set(others.map((spec) => spec.stage))].map((stage) => groupOf(stage, others.filter((spec) => spec.stage === stage)))];
   const sets = el("details", { class: "tune-part" }, el("summary", { text: "Sets and files" }),
@@ -43,16 +42,15 @@ function build() {
       el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
       el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName })));
   byId("panel-tune").replaceChildren(
-    el("div", { class: "tune-head" },
+    el("div", { class: "tune-top" }, el("div", { class: "tune-head" },
       el("select", { id: "tune-set", "aria-label": "Preset or saved set", onchange: (event) => use(event.target.value) }),
       button("tune-undo", "Undo", "Undo the last parameter change (Ctrl+Z in this tab)", undo), button("tune-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo),
       button("tune-reset", "Reset all", "Reset all values to the preset", () => reset([])),
-      find, el("label", { class: "tune-only" }, only, " changed only")),
-    sets,
-    el("p", { id: "tune-error", class: "error", role: "alert", hidden: true }),
-    el("div", { class: "tune-effect" }, counts, wholeRun),
+      find, el("label", { class: "tune-only", title: "Only the parameters whose values differ from the preset" }, only, " changed")),
+    el("div", { class: "tune-effect" }, el("p", { id: "tune-error", class: "error", role: "alert", hidden: true }), counts, wholeRun)),
     el("div", { id: "tune-rows" }, ...parts),
     el("p", { id: "tune-none", class: "empty", hidden: true }),
+    sets,
     ...ofExtensions("tuneParts"));
   show();
 }
@@ -191,8 +189,10 @@ export const openSearch = () => { openTab("tune"); byId("tune-find")?.focus(); }
 
 export function startTunePanel() {
   startWholeRun();
+  byId("undo").addEventListener("click", undo);
   on("specs", build);
   on("parameters sets", () => isTuning() && show());
+  on("parameters", () => { byId("undo").disabled = !state.parameters?.undo; });
   on("tuning", showError);
   on("tab", () => isTuning() && show());
   on("map status parameters", showCounts);

@@ -69,9 +69,12 @@ export const forget = (name) => attempt(() => post("/api/sets/delete", { name })
 export const takeFile = (file, text) => attempt(() => post("/api/sets/upload", { file: file.slice(0, 100), text }));
 export const refuse = (text) => { tuning.error = text; changed("tuning"); };
 
-// Ctrl+Z, Ctrl+Shift+Z and Ctrl+Y while the tab is open. Returns whether the key was one of them.
-export function tuneKey(event) {
-  if (!isTuning() || !(event.ctrlKey || event.metaKey) || event.altKey) return false;
+// While the tab is open. Returns whether the key was one of them.
+export const tuneKey = (event) => isTuning() && undoKey(event);
+
+// Ctrl+Z, Ctrl+Shift+Z and Ctrl+Y. Returns whether the key was one of them.
+export function undoKey(event) {
+  if (!(event.ctrlKey || event.metaKey) || event.altKey) return false;
   const key = event.key.toLowerCase();
   if (key === "y" || (key === "z" && event.shiftKey)) redo();
   else if (key === "z") undo();

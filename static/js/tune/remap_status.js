@@ -20,11 +20,14 @@ export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The
   el("label", { title: "On: each change re-maps the run from its first scan, so that the map and its scores follow. Off: changes apply from the current scan onwards" }, box, " whole run"),
   note, progress, all);
 
+// Most changes of the clusters do not alter such a map.
+const WHY_SAME = { columns: "This map is made of the accumulated scans (classification.method = columns), not of the clusters of each one." };
+
 function resultText(remapped) {
   const { after, scans, time_s: end, changes } = remapped;
   const number = (kind) => changes.filter((change) => change.kind === kind).length;
   const parts = Object.keys(SIGNS).map((kind) => number(kind) && `${number(kind)} ${kind}`).filter(Boolean);
-  return `Re-mapped${endText(scans, end)}: ${count(after, "tree")}, ${parts.length ? parts.join(", ") : "none moved"}.`;
+  return `Re-mapped${endText(scans, end)}: ${count(after, "tree")}, ${parts.length ? parts.join(", ") : `the same as before. ${WHY_SAME[state.parameters?.values["classification.method"]] ?? ""}`}`;
 }
 
 // The re-mapping ends at the current scan; later scans are mapped when the run reaches them.

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from app.scene import Scene
-from app.scene.nodes import MOST_LABELS, Label, LabelNodes
-from app.scene.scan import cluster_labels, short
+from app.scene.nodes import MOST_LABELS, Label, LabelNodes, short
+from app.scene.scan import cluster_labels
 from tests.app.scene.frames import make_frame, make_trees, texts_of
 
 PATH = np.zeros((1, 4))
@@ -20,8 +20,8 @@ def test_clusters_are_labelled_by_the_ratio_of_eigenvalues_and_trees_by_dbh(scen
     frame = make_frame(0, trees=4, clusters=3)
     far = replace(frame.clusters, centroid=frame.clusters.centroid * np.array([4.0, 4.0, 1.0]))
     scene.show(replace(frame, clusters=far), PATH)
-    assert {"λ1/λ2 5.0", "λ1/λ2 ∞"} <= set(texts_of(scene._scan._labels))
-    assert any(re.fullmatch(r"\d+: \d+ cm", text) for text in texts_of(scene._map._labels))
+    assert {"e 5.0", "e ∞"} <= set(texts_of(scene._scan._labels))
+    assert any(re.fullmatch(r"\d+: \d+ cm, e \d+(\.\d)?", text) for text in texts_of(scene._map._labels))
     scene.choose("labels", False)
     assert texts_of(scene._scan._labels) == texts_of(scene._map._labels) == []
 

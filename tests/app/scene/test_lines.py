@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import Scene, colours
-from app.scene.nodes import CHUNK, LineNode
+from app.scene.nodes import CHUNK, LineNode, Segments
 
 
 def drawn(line: LineNode) -> np.ndarray:
@@ -43,6 +43,14 @@ async def test_a_step_forward_sends_only_the_last_piece(scene: Scene):
     before = scene.messages
     line.show(True, points[:701])
     assert scene.messages - before == 1
+
+
+def test_one_colour_of_all_segments_is_sent_for_each_of_them(scene: Scene):
+    """viser's client takes a single one as sRGB, unlike those of segments, so the path was nearly black."""
+    lines = Segments(scene._server.scene, "/one", 1.0)
+    lines.show(True, np.zeros((2, 2, 3)), colours.PATH)
+    wanted = colours.of_lines(np.array([colours.PATH], np.uint8))[0]
+    np.testing.assert_array_equal(lines.node.colors, np.broadcast_to(wanted, (2, 2, 3)))
 
 
 def test_lines_are_seen_in_the_colour_that_was_meant():
