@@ -7,12 +7,13 @@ The same run gives the same bytes: time stamps in the files are fixed.
 from __future__ import annotations
 
 import datetime
+import json
 import math
 import os
 import sqlite3
 import threading
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
@@ -20,6 +21,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import shapely
+import shapely.geometry
 
 from app.batch.map_frame import (
     LOCAL_NAME,
@@ -33,7 +35,7 @@ from app.batch.map_frame import (
 from app.batch.run_folder import read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
-from pipeline.io.result_files import geojson
+from pipeline.io.result_files import ROBOTS_FRAME, geojson
 from pipeline.types.records import Trees
 
 #: Date of all files.
@@ -331,14 +333,46 @@ STYLES = {
 }
 
 
-def write_geojson(run: ExportedRun, file: FilePath) -> None:
-    """Write the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map."""
-    lon_lat = None
-    if run.frame.crs:
-        lon_lat = reproject(run.place, run.frame.crs, WGS84)
+def trees_geojson(run: ExportedRun) -> str:
+    """Return the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map."""
+    lon_lat = reproject(run.place, run.frame.crs, WGS84) if run.frame.crs else None
     reviews = dict(zip(run.columns["tree"].tolist(), run.columns["review"].tolist(), strict=True))
-    text = geojson(run.trees, 0, lon_lat=lon_lat, reviews=reviews)
-    file.write_text(text, encoding="utf-8", newline="")
+    return geojson(run.trees, 0, lon_lat=lon_lat, reviews=reviews)
+
+
+def path_geojson(run: ExportedRun) -> str:
+    """Return the path as GeoJSON, see `shapes_geojson`; no feature for a path of one position."""
+    path = shapely.LineString(run.path) if len(run.path) > 1 else None
+    return shapes_geojson([] if path is None else [("path", path)], run.frame)
+
+
+def shapes_geojson(shapes: Sequence[tuple[str, Any]], frame: MapFrame) -> str:
+    """Return named shapes as a GeoJSON FeatureCollection with the property `name`: in longitude and latitude
+    (WGS84), or with the member `coordinateFrame` in the frame of a local map [m].
+
+    Args:
+        shapes: Names with shapely geometries in the reference system of the frame.
+        frame: Reference system of the run.
+    """
+    collection: dict[str, Any] = {"type": "FeatureCollection"}
+    if not frame.crs:
+        collection["coordinateFrame"] = dict(ROBOTS_FRAME)
+    collection["features"] = [
+        {
+            "type": "Feature",
+            "geometry": shapely.geometry.mapping(
+                shapely.transform(shape, lambda xy: reproject(xy, frame.crs, WGS84)) if frame.crs else shape
+            ),
+            "properties": {"name": name},
+        }
+        for name, shape in shapes
+    ]
+    return json.dumps(collection) + "\n"
+
+
+def write_geojson(run: ExportedRun, file: FilePath) -> None:
+    """Write the trees as GeoJSON, see `trees_geojson`."""
+    file.write_text(trees_geojson(run), encoding="utf-8", newline="")
 
 
 WRITERS: dict[str, Writer[ExportedRun]] = {".gpkg": _write_layers, ".geojson": write_geojson}

@@ -107,7 +107,7 @@ def test_a_press_on_a_slider_changes_nothing_and_a_drag_is_one_step(dashboard: D
     page, scene = dashboard.page, dashboard.scene
     dashboard.until_scene_is_named()
     before = dashboard.ask("/api/parameters")
-    main = [spec for spec in before["specs"] if spec["main"]]
+    main = sorted((spec for spec in before["specs"] if spec["main"]), key=lambda s: s["stage"] == "Filters")
     of_kind = {(spec["kind"], spec["log"]): (k, spec) for k, spec in reversed(list(enumerate(main)))}
     assert (
         len(of_kind) >= 3
@@ -394,8 +394,9 @@ def test_a_click_on_a_cluster_shows_why_it_is_not_a_tree(dashboard: Dashboard):
     panel = page.locator("#panel-story")
     read: dict[str, int] = {}
     places = dashboard.settled_places(MARKERS)
+    trees = dashboard.places_in_scene("/world/trees")  # which take the clicks on their clusters
     for cluster, (x, y) in enumerate(places):
-        others = (place for k, place in enumerate(places) if k != cluster)
+        others = trees + [place for k, place in enumerate(places) if k != cluster]
         if any(hypot(x - u, y - v) < APART for u, v in others):
             continue
         # Not below viser's own panel and notices.
@@ -470,13 +471,15 @@ LABELS = """() => {
 def test_labels_do_not_cover_one_another_wherever_the_camera_is(dashboard: Dashboard):
     dashboard.load_scene()
     dashboard.page.locator("#map").press("Escape")
+    hidden = 0
     for tree in (5, 23, 12):  # the camera flies to each of them
         dashboard.tab("Trees")
         dashboard.page.locator("#trees tbody tr").nth(tree).click()
         dashboard.settled_places("/world/trees")
         told = dashboard.scene.evaluate(LABELS)
         boxes = told["boxes"]
-        assert 1 < len(boxes) < told["sent"], "some are hidden"
+        assert 1 < len(boxes) <= told["sent"]
+        hidden += told["sent"] - len(boxes)
         covered = [
             (a, b)
             for k, a in enumerate(boxes)
@@ -484,6 +487,7 @@ def test_labels_do_not_cover_one_another_wherever_the_camera_is(dashboard: Dashb
             if a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
         ]
         assert covered == []
+    assert hidden > 0
 
 
 # Rules of axe-core that elements of viser's client break.

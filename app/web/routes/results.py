@@ -21,7 +21,7 @@ from app.dashboard.payload import (
     trees_payload,
 )
 from app.dashboard.scores import pairs_payload
-from app.dashboard.selection import NothingMappedError
+from app.dashboard.selection import NoStoryError, NothingMappedError
 from app.dashboard.shown_run import ShownRun
 from app.sources import opening
 from app.web.responses import (
@@ -142,6 +142,24 @@ async def exported_file(run: ShownRun, question: dict[str, Any], there: FilePath
     )
 
 
+@router.get("/layers/{layer}.geojson", dependencies=[ViewerTurn])
+async def layer(layer: Literal["trees", "path"], dashboard: Dash) -> Response:
+    """Return the trees or the path of the present map as GeoJSON for other programs, which ask again to be up
+    to date: in WGS84, or in the frame of a local map. 409 before the first map."""
+    from app.batch import export
+
+    text_of = {"trees": export.trees_geojson, "path": export.path_geojson}[layer]
+
+    def written(run: ShownRun) -> str:
+        with run.folder() as folder:
+            return text_of(export.read_for_export(folder))
+
+    run = ShownRun.of(dashboard)
+    with as_bad_request():
+        text = await asyncio.to_thread(written, run)
+    return text_reply(text, f"{layer}.geojson", "application/geo+json")
+
+
 @router.get("/evaluation")
 async def evaluation(dashboard: Dash) -> Response:
     """GET /api/evaluation: return the score against the ground truth, see `score_payload`; null without
@@ -228,9 +246,12 @@ async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
 
 @router.get("/camera/tree/{number}.jpg", dependencies=[ViewerTurn])
 async def tree_picture(number: Number, dashboard: Dash, shown: NewestScan) -> Response:
-    """Return the part of the camera picture that shows a tree best, as JPEG; 404 if no picture shows it, 409
-    before the first map, 503 if the worker is busy."""
-    content = await dashboard.camera.tree(number, shown.frame.trees, dashboard.path)
+    """Return the part of the camera picture that shows a tree best, as JPEG; an empty answer (204) if no
+    picture shows it, 409 before the first map, 503 if the worker is busy."""
+    try:
+        content = await dashboard.camera.tree(number, shown.frame.trees, dashboard.path)
+    except NoStoryError:  # usual for a tree behind the camera; browsers would log 404 as an error
+        return Response(status_code=204)
     return bytes_reply(content, "image/jpeg")
 
 

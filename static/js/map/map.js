@@ -59,7 +59,13 @@ const truthAt = (at) => nearest(state.truth ?? [], gapTo(at), POINT_REACH);
 const SAME = 0.01; // [m] between an annotation and its copy in the ground truth
 
 function describe(at) {
-  const [tree, truth, cluster] = [treeAt(trees(), at, map.view), truthAt(at), clusterAt(at)];
+  let [tree, truth] = [treeAt(trees(), at, map.view), truthAt(at)];
+  const cluster = clusterAt(at);
+  // An annotation beside a tree is not that tree: what is nearer to the pointer is meant.
+  if (tree && truth && distance(tree, truth) > (state.parameters?.values["evaluation.match_distance"] ?? 0.5)) {
+    if (gapTo(at)(truth) < gapTo(at)(tree)) tree = null;
+    else truth = null;
+  }
   canvas.classList.toggle("hits", Boolean(tree ?? cluster ?? truth));
   if (measuring()) return state.measure.from === null ? "Click where the distance begins" : "";
   if (draft.adding || byTool("busy") || !(tree ?? truth ?? cluster)) return "";

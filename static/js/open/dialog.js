@@ -1,10 +1,12 @@
 // The dialog to open a run.
 
-import { get, open } from "../core/api.js";
+import { open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { parametersText } from "../playback/timeline.js";
+import { ofExtensions } from "../shell/extensions.js";
+import { completion, listPlaces, nearMisses, sift } from "./places.js";
 import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
@@ -19,76 +21,45 @@ export async function openSources(begin = "") {
   if (!dialog.open) dialog.showModal();
   const address = byId("source-uri");
   if (typeof begin === "string" && begin) address.value = begin;
-  showChoice();
+  show();
   const { changed: values = [] } = state.parameters ?? {};
   byId("source-parameters").hidden = !values.length;
   setText(byId("source-parameters"), values.length ? `The run opens with the parameters in force: ${parametersText()}. Reset all in Tune returns to the preset.` : "");
   address.focus();
   try {
-    list(await get("/api/sources"));
+    await listPlaces(choose);
   } catch (error) {
     say(error.message);
   }
 }
 
-function list({ scenarios = [], recordings = [] }) {
-  const simulated = scenarios.map(({ uri, doc }) => entry(uri, uri, doc, () => withOptions(uri)));
-  const recorded = recordings.map(({ uri, name, doc }) => entry(uri, name, doc));
-  byId("source-list").replaceChildren(
-    ...(recorded.length ? [el("h3", { text: "Recordings in the data folder" }), ...recorded] : []),
-    ...(simulated.length ? [el("h3", { text: "Simulated, with ground truth" }),
-      el("p", { class: "source-options" }, option("seed", "Seed of the stand (another seed is another stand)", "0", "1"), option("duration", "Duration s", "1", "0.1", "3600")), ...simulated] : []));
+// A place of the list is opened, or written into the field if something is chosen for it first.
+function choose(uri) {
+  if (!ofExtensions("sourceChoice").some((each) => each.takes(uri))) return ask(uri);
+  byId("source-uri").value = uri;
+  show();
+  return byId("source-open").focus();
 }
 
-const option = (name, title, min, step, max) => el("label", {}, `${title} `, el("input", { id: `source-${name}`, type: "number", min, step, max, placeholder: "standard" }));
-
-// The address of a scenario with the typed seed and duration.
-function withOptions(uri) {
-  const typed = ["seed", "duration"].map((name) => [name, byId(`source-${name}`).value]).filter(([, value]) => value);
-  return typed.length ? `${uri}?${new URLSearchParams(typed)}` : uri;
-}
-
-const entry = (uri, title, doc, address = () => uri) =>
-  el("button", { type: "button", onclick: () => (isWholeCloud(uri) ? offerChoice(uri) : ask(address())) }, el("b", { text: title }), el("span", { text: doc }));
-
-// --- whole clouds: mapped as a whole, or driven through by a simulated robot ---------------------------
-
-const isWholeCloud = (uri) => /\.(laz|las|e57|ply|npy|npz|pcd|xyz|asc|pts|txt|csv)$/i.test(uri);
-const choice = () => byId("source-form").elements.namedItem("cloud-choice").value;
 const path = () => byId("source-uri").value.trim();
-const CHOICES = ["source-as", "source-unit", "source-up", "source-odometry"]; // of one source; topics and mounting are kept by address
+// What an extension lets a person choose for the typed path.
+const choice = () => ofExtensions("sourceChoice").find((each) => each.takes(path()));
 let chosenAt = ""; // path for which they were chosen; "" if before a path was entered
 
 function forget() {
-  for (const id of CHOICES) byId(id).value = "auto";
-  byId("source-form").elements.namedItem("cloud-choice").value = "map";
+  byId("source-odometry").value = "auto"; // topics and mounting are kept by address
+  for (const each of ofExtensions("sourceChoice")) each.forget();
   chosenAt = "";
 }
 
-// A whole cloud that is mapped as it is has no odometry; a robot that drives through it has. Choices for another path do not count.
-function showChoice() {
+// Choices for another path do not count.
+function show() {
   if (chosenAt && chosenAt !== path()) forget();
-  const cloud = isWholeCloud(path());
-  byId("source-cloud").hidden = !cloud;
-  byId("source-motion").hidden = cloud && choice() === "map";
+  const chosen = choice();
+  for (const { node } of ofExtensions("sourceChoice")) node.hidden = node !== chosen?.node;
+  byId("source-motion").hidden = chosen !== undefined && !chosen.moves();
+  sift();
 }
-
-// A cloud of the list is written into the field, above which the choice is.
-function offerChoice(uri) {
-  byId("source-uri").value = uri;
-  showChoice();
-  byId("source-open").focus();
-}
-
-// Form, unit and axis that were chosen for the file of points in the field; {} for other sources.
-function chosenPoints(uri) {
-  const typed = path();
-  if (!isWholeCloud(typed) || uri !== chosenUri(typed)) return {};
-  const chosen = { form: byId("source-as").value, unit: byId("source-unit").value, up: byId("source-up").value };
-  return Object.fromEntries(Object.entries(chosen).filter(([, value]) => value !== "auto"));
-}
-
-const chosenUri = (uri) => (isWholeCloud(uri) && choice() === "drive" ? `sim:cloud?${new URLSearchParams({ file: uri })}` : uri);
 
 export async function ask(uri) {
   if (!uri) {
@@ -100,7 +71,7 @@ export async function ask(uri) {
   say("");
   setText(byId("source-open"), "Opening…");
   try {
-    await open({ uri, odometry: byId("source-odometry").value, ...chosenPoints(uri), ...chosenFor(uri) });
+    await open({ uri, odometry: byId("source-odometry").value, ...(uri === choice()?.address(path()) ? choice().fields() : {}), ...chosenFor(uri) });
     if (requested !== uri) return;
     asked = uri;
     follow(state);
@@ -126,6 +97,9 @@ function say(text) {
   const error = byId("source-error");
   setText(error, capital(text));
   error.hidden = !text;
+  const near = text ? nearMisses(path()) : [];
+  byId("source-near").hidden = !near.length;
+  byId("source-near").replaceChildren("Did you mean ", ...near.flatMap((uri, k) => [k ? ", " : "", el("button", { class: "link", type: "button", text: uri, onclick: () => choose(uri) })]), "?");
 }
 
 export function startSources() {
@@ -133,12 +107,21 @@ export function startSources() {
   byId("source-close").addEventListener("click", () => finish(""));
   byId("source-form").addEventListener("submit", (event) => {
     event.preventDefault();
-    ask(chosenUri(path()));
+    ask(choice()?.address(path()) ?? path());
   });
-  byId("source-uri").addEventListener("input", showChoice);
-  for (const id of ["source-cloud", "source-motion"]) byId(id).addEventListener("change", () => {
+  const field = byId("source-uri");
+  field.addEventListener("input", show);
+  field.addEventListener("keydown", (event) => { // completes the path, as in a terminal
+    if (event.key !== "Tab" || event.shiftKey || !completion() || completion() === path()) return;
+    event.preventDefault();
+    field.value = completion();
+    show();
+  });
+  const choices = [...ofExtensions("sourceChoice").map(({ node }) => node), byId("source-motion")];
+  byId("source-error").before(...choices.slice(0, -1));
+  for (const node of choices) node.addEventListener("change", () => {
     chosenAt = path();
-    showChoice();
+    show();
   });
   dialog.addEventListener("close", forget);
   startInside();

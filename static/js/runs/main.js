@@ -12,6 +12,8 @@ import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
 const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["pose lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"]];
+const comparable = ofExtensions("pairViews").length > 0;
+if (!comparable) HEADS.shift(); // no boxes to tick
 const REFRESH_EVERY = 5000; // [ms]
 let known = { runs: [], folders: [], open: null }, listed = ""; // the answer of the server, and its text
 let requests = 0, waiting = 0; // requests that were sent, and those without an answer
@@ -64,8 +66,8 @@ function row(run) {
   const texts = run.id === undefined ? [when(run.changed_s), "", "", "", "", "", ""]
     : [when(run.begun_s), scans(run), figure(run.distance_m), percent(run.lost), String(run.trees), figure(run.scores?.f1), run.annotated ? String(run.annotated) : NONE];
   return el("tr", { "data-run": run.key, onclick: () => go(addressOf(run)) },
-    el("td", { onclick: (event) => event.stopPropagation() }, el("input", { type: "checkbox", "aria-label": `Compare ${run.name}`, checked: ticked.has(run.key), onchange: (event) => tick(run.key, event.target.checked) })),
-    name, ...texts.map((text, k) => el("td", { class: HEADS[k + 2][1], text })));
+    comparable ? el("td", { onclick: (event) => event.stopPropagation() }, el("input", { type: "checkbox", "aria-label": `Compare ${run.name}`, checked: ticked.has(run.key), onchange: (event) => tick(run.key, event.target.checked) })) : "",
+    name, ...texts.map((text, k) => el("td", { class: HEADS[k + HEADS.length - texts.length][1], text })));
 }
 
 // At most two runs are ticked; a third one replaces the oldest.
@@ -157,7 +159,7 @@ startUpload(async ({ uri }) => {
 });
 startTheme();
 startExtensions();
-byId("runs-compare").hidden = !ofExtensions("pairViews").length;
+byId("runs-compare").hidden = !comparable;
 startAccess();
 load();
 follow();

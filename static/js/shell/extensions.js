@@ -14,6 +14,9 @@
 //                     while the tool is in use
 //   exportFiles()     files for the menu Export, [{value, text, before, save}, ...], with the value of the option behind it; save(title)
 //                     saves the file of a run with this title, also in place of an option with the same value
+//   sourceChoice()    what is chosen in the dialog Open, {node, takes(path), moves(), address(path), fields(), forget()}: the element,
+//                     for which paths it is shown, whether the source has a motion, the address of the path and fields of the
+//                     request by the choices, and back to the beginning
 //   runButtons(run, title)  buttons of a run on the page of runs
 //   pairViews()       what shows two runs on that page: functions of their keys
 //   treeStory(story), clusterStory(story)  elements in place of the story of a tree or cluster; none for other stories

@@ -9,7 +9,7 @@ import { attempt, isTuning } from "./parameters.js";
 
 const MOST = 30; // lines of the list
 const SIGNS = { appeared: "+", vanished: "−", moved: "→" };
-let begun = null; // {share, at, left, estimatedAt}: start of the re-mapping, and the estimate of the time left [s]
+let begun = []; // [share, time [s]] of the re-mapping in the last PACE seconds, the oldest first
 const progress = el("progress", { id: "tune-progress", max: "1", hidden: true, "aria-label": "Progress of the re-mapping" });
 const note = el("p", { id: "tune-whole-status", class: "note dim", role: "status" });
 const list = el("ul", { id: "tune-changes" });
@@ -37,19 +37,17 @@ function endText(scans, end) {
   return partial ? ` to ${clock(end)}` : "";
 }
 
-const FIRST = 2; // [s] without an estimate: kernels are loaded and the current scan is mapped
-const SMOOTH = 0.15; // weight of the newest estimate
+const PACE = 6; // [s] of which the pace counts; at the beginning kernels are loaded and the current scan is mapped
 
-// The estimated time left as text; empty while there is no estimate.
+// The estimated time left as text; empty while the pace is not known.
 function left(share) {
   const now = performance.now() / 1000;
-  if (!begun || share < begun.share) begun = { share, at: now, left: null, estimatedAt: now };
-  const spent = now - begun.at;
-  if (spent < FIRST || share - begun.share < 0.02) return "";
-  const guess = (spent * (1 - share)) / (share - begun.share);
-  const before = begun.left === null ? guess : Math.max(begun.left - (now - begun.estimatedAt), 0);
-  Object.assign(begun, { left: before + SMOOTH * (guess - before), estimatedAt: now });
-  return `, about ${roughly(begun.left)} left`;
+  if (share < (begun.at(-1)?.[0] ?? 0)) begun = [];
+  begun.push([share, now]);
+  while (begun.length > 2 && begun[0][1] < now - PACE) begun.shift();
+  const [[before, then]] = begun;
+  if (now - then < PACE / 2 || share - before < 0.02) return "";
+  return `, about ${roughly(((now - then) * (1 - share)) / (share - before))} left`;
 }
 
 // The preview has no score: it is only roughly right.
@@ -62,7 +60,7 @@ function show() {
   const share = state.status?.remapped ?? null;
   const preview = share !== null && state.rough?.revision === state.parameters?.revision ? state.rough : null;
   const newest = share === null && state.remapped?.revision !== state.parameters?.revision ? null : state.remapped; // else a parameter changed since then
-  if (share === null) begun = null;
+  if (share === null) begun = [];
   box.checked = state.parameters?.whole ?? true;
   progress.hidden = share === null;
   all.hidden = !newest || !newest.changes.length;
@@ -73,7 +71,8 @@ function show() {
     changed("ghost");
   }
   if (share !== null) setText(note, progressText(share, preview));
-  else setText(note, newest ? resultText(newest) : box.checked ? "Each change re-maps the run from its start to the shown scan." : "Changes apply from the current scan onwards.");
+  else setText(note, newest ? resultText(newest) : !box.checked ? "Changes apply from the current scan onwards."
+    : state.status?.live ? "Live: changes of SLAM, tracks and classes re-map the run; others need points and apply from now on." : "Each change re-maps the run up to the shown scan.");
 }
 
 const lineOf = (kind, sign, node, why) => el("li", { "data-kind": kind }, el("b", { text: sign, "aria-hidden": "true" }), node, el("small", { text: why }));

@@ -97,6 +97,7 @@ ROUTES = [
     ("GET", "/api/path.csv"),
     ("GET", "/api/export/laz"),
     ("GET", "/api/export/{suffix}"),
+    ("GET", "/api/layers/{layer}.geojson"),
     ("GET", "/api/evaluation"),
     ("GET", "/api/pairs"),
     ("GET", "/api/story/cluster/{number}"),

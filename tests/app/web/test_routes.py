@@ -396,6 +396,23 @@ async def test_the_export_gives_the_bytes_of_the_command(both: Running, tmp_path
     assert reply.headers["content-disposition"] == f'attachment; filename="trees.{suffix}"'
 
 
+async def test_layers_for_other_programs_follow_the_run(both: Running) -> None:
+    client, dashboard = both
+    assert (await client.get("/api/layers/trees.geojson")).status_code == 409
+    await show(dashboard)
+    assert dashboard.shown is not None
+    trees = await client.get("/api/layers/trees.geojson")
+    assert trees.headers["content-type"].startswith("application/geo+json")
+    confirmed = int(dashboard.shown.frame.trees.confirmed.sum())
+    assert len(trees.json()["features"]) == confirmed > 0
+    assert trees.json() == (await client.get("/api/export/geojson")).json()
+    path = (await client.get("/api/layers/path.geojson")).json()
+    assert path["coordinateFrame"]["type"] == "local"
+    (line,) = path["features"]
+    assert (line["geometry"]["type"], line["properties"]) == ("LineString", {"name": "path"})
+    assert len(line["geometry"]["coordinates"]) > 1
+
+
 async def test_the_files_of_a_run_of_one_step_are_in_its_coordinates(both: Running) -> None:
     client, dashboard = both
     await show(dashboard)

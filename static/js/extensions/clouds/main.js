@@ -1,6 +1,7 @@
-// Stories of the stems of a whole cloud.
+// Whole clouds: what is chosen before one is opened, and the stories of its stems.
 
 import { extend } from "../../shell/extensions.js";
+import { sourceChoice } from "./open.js";
 import { clusterStory, treeEvidence, treeStory } from "./stems.js";
 
-extend(import.meta.url, { clusterStory, treeEvidence, treeStory });
+extend(import.meta.url, { clusterStory, sourceChoice, treeEvidence, treeStory });

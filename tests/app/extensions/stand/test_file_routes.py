@@ -6,8 +6,10 @@ import io
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from tests.app.extensions.stand.test_plot_routes import CIRCLE, act
 from tests.app.server_for_tests import Running
 from tests.app.web.test_routes import exported_twice, show
 
@@ -32,3 +34,16 @@ async def test_an_export_that_the_map_lacks_is_refused(both: Running) -> None:
     terrain = await client.get("/api/export/tif")
     assert terrain.status_code == 422
     assert "no terrain" in terrain.text
+
+
+async def test_plots_are_a_layer_for_other_programs(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    assert (await client.get("/api/layers/plots.geojson")).json()["features"] == []
+    await act(client, "POST", plots=[{**CIRCLE, "name": "north"}])
+    (plot,) = (await client.get("/api/layers/plots.geojson")).json()["features"]
+    assert plot["properties"] == {"name": "north"}
+    ring = np.array(plot["geometry"]["coordinates"][0])
+    shape = CIRCLE["shape"]
+    gaps = np.hypot(ring[:, 0] - shape["x"], ring[:, 1] - shape["y"])
+    np.testing.assert_allclose(gaps, shape["radius"], rtol=1e-3)

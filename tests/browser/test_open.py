@@ -1,0 +1,97 @@
+"""The dialog Open: places to choose from, near misses, and what extensions add to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.browser.conftest import opened
+from tests.browser.serving import Server
+
+SOURCE = "sim:stand?duration=5"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with recordings in folders; they are listed by their names."""
+    made = tmp_path_factory.mktemp("data")
+    for name in ("spring/north stand.mcap", "spring/south stand.mcap", "autumn/plot.laz"):
+        file = made / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(b"")
+    return made
+
+
+@pytest.fixture(scope="module", params=["", "clouds,stand"], ids=["core", "extensions"])
+def extensions(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Browser, folder: Path, extensions: str) -> Iterator[Page]:
+    with (
+        Server(SOURCE, STEMMAP_FOLDER=str(folder), STEMMAP_EXTENSIONS=extensions) as server,
+        opened(chromium, server.link) as made,
+    ):
+        made.pause()
+        yield made.page
+
+
+@pytest.fixture
+def dialog(page: Page) -> Iterator[Page]:
+    page.locator("#source-button").click()
+    page.locator("#source-uri").fill("")
+    expect(page.locator("#source-list summary").last).to_be_visible()
+    yield page
+    page.locator("#source-close").click()
+
+
+def test_recordings_are_a_tree_and_simulated_runs_are_folded(dialog: Page) -> None:
+    listed = dialog.locator("#source-list")
+    expect(listed.get_by_text("spring/", exact=True)).to_be_visible()
+    expect(listed.get_by_text("sim:forest", exact=True)).to_be_hidden()
+    listed.get_by_text("spring/", exact=True).click()
+    expect(listed.get_by_text("north stand.mcap", exact=True)).to_be_visible()
+    listed.get_by_text("Simulated, with ground truth").click()
+    expect(listed.get_by_text("sim:forest", exact=True)).to_be_visible()
+
+
+def test_what_is_typed_filters_and_tab_completes(dialog: Page, folder: Path) -> None:
+    field, shown = dialog.locator("#source-uri"), dialog.locator("#source-list button:visible")
+    field.press_sequentially("south")
+    expect(shown).to_have_count(1)
+    expect(shown).to_contain_text("south stand.mcap")
+    field.press("Tab")
+    expect(field).to_have_value(str(folder / "spring" / "south stand.mcap"))
+    field.fill("nothing like it")
+    expect(dialog.locator("#source-none")).to_be_visible()
+
+
+def test_a_near_miss_is_suggested(dialog: Page, folder: Path) -> None:
+    dialog.locator("#source-uri").fill(str(folder / "spring" / "nort stand.mcap"))
+    dialog.locator("#source-open").click()
+    near = dialog.locator("#source-near")
+    expect(near).to_contain_text("Did you mean")
+    expect(near.get_by_role("button").first).to_have_text(str(folder / "spring" / "north stand.mcap"))
+
+
+def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extensions(
+    dialog: Page, folder: Path, extensions: str
+) -> None:
+    dialog.locator("#source-uri").fill("plot.laz")
+    assert dialog.locator("#source-cloud").count() == (1 if extensions else 0)
+    if extensions:
+        expect(dialog.locator("#source-cloud")).to_be_visible()
+    html = dialog.evaluate("async () => (await (await fetch('/api/runs')).json()).runs.length")
+    assert html == 1
+    address = dialog.url
+    dialog.goto(address.split("?")[0] + "runs")
+    expect(dialog.locator("#runs tbody tr")).to_have_count(1)
+    assert dialog.locator("#runs input[type=checkbox]").count() == (1 if extensions else 0)
+    heads = dialog.locator("#runs thead tr > *").count()
+    assert dialog.locator("#runs tbody tr > *").count() == heads
+    dialog.goto(address)
+    dialog.locator("#source-button").click()
