@@ -17,10 +17,10 @@ SOURCE = "sim:stand?duration=5"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with recordings in folders; they are listed by their names."""
-    made = tmp_path_factory.mktemp("data")
-    for name in ("spring/north stand.mcap", "spring/south stand.mcap", "autumn/plot.laz"):
+    made: Path = tmp_path_factory.mktemp("data") / "recordings"
+    for name in ("spring/north stand.pcap", "spring/south stand.pcap", "autumn/plot.e57"):
         file = made / name
-        file.parent.mkdir(exist_ok=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(b"")
     return made
 
@@ -33,9 +33,10 @@ def extensions(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="module")
 def page(chromium: Browser, folder: Path, extensions: str) -> Iterator[Page]:
     with (
-        Server(SOURCE, STEMMAP_FOLDER=str(folder), STEMMAP_EXTENSIONS=extensions) as server,
+        Server(SOURCE, STEMMAP_FOLDER=str(folder.parent), STEMMAP_EXTENSIONS=extensions) as server,
         opened(chromium, server.link) as made,
     ):
+        made.until_server("/api/runs", "it.runs.length === 1")
         made.pause()
         yield made.page
 
@@ -52,30 +53,30 @@ def dialog(page: Page) -> Iterator[Page]:
 def test_recordings_are_a_tree_and_simulated_runs_are_folded(dialog: Page) -> None:
     listed = dialog.locator("#source-list")
     expect(listed.get_by_text("spring/", exact=True)).to_be_visible()
-    expect(listed.get_by_text("sim:forest", exact=True)).to_be_hidden()
+    expect(listed.get_by_text("sim:long", exact=True)).to_be_hidden()
     listed.get_by_text("spring/", exact=True).click()
-    expect(listed.get_by_text("north stand.mcap", exact=True)).to_be_visible()
+    expect(listed.get_by_text("north stand.pcap", exact=True)).to_be_visible()
     listed.get_by_text("Simulated, with ground truth").click()
-    expect(listed.get_by_text("sim:forest", exact=True)).to_be_visible()
+    expect(listed.get_by_text("sim:long", exact=True)).to_be_visible()
 
 
 def test_what_is_typed_filters_and_tab_completes(dialog: Page, folder: Path) -> None:
     field, shown = dialog.locator("#source-uri"), dialog.locator("#source-list button:visible")
     field.press_sequentially("south")
     expect(shown).to_have_count(1)
-    expect(shown).to_contain_text("south stand.mcap")
+    expect(shown).to_contain_text("south stand.pcap")
     field.press("Tab")
-    expect(field).to_have_value(str(folder / "spring" / "south stand.mcap"))
+    expect(field).to_have_value(str(folder / "spring" / "south stand.pcap"))
     field.fill("nothing like it")
     expect(dialog.locator("#source-none")).to_be_visible()
 
 
 def test_a_near_miss_is_suggested(dialog: Page, folder: Path) -> None:
-    dialog.locator("#source-uri").fill(str(folder / "spring" / "nort stand.mcap"))
+    dialog.locator("#source-uri").fill(str(folder / "spring" / "nort stand.pcap"))
     dialog.locator("#source-open").click()
     near = dialog.locator("#source-near")
     expect(near).to_contain_text("Did you mean")
-    expect(near.get_by_role("button").first).to_have_text(str(folder / "spring" / "north stand.mcap"))
+    expect(near.get_by_role("button").first).to_have_text(str(folder / "spring" / "north stand.pcap"))
 
 
 def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extensions(
@@ -85,8 +86,8 @@ def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extension
     assert dialog.locator("#source-cloud").count() == (1 if extensions else 0)
     if extensions:
         expect(dialog.locator("#source-cloud")).to_be_visible()
-    html = dialog.evaluate("async () => (await (await fetch('/api/runs')).json()).runs.length")
-    assert html == 1
+    runs = dialog.evaluate("async () => (await (await fetch('/api/runs')).json()).runs.length")
+    assert runs == 1
     address = dialog.url
     dialog.goto(address.split("?")[0] + "runs")
     expect(dialog.locator("#runs tbody tr")).to_have_count(1)
