@@ -160,6 +160,7 @@ def test_sliders_are_in_view_and_none_moves_while_one_is_dragged(
     before = page.viewport_size
     assert before is not None
     page.set_viewport_size({"width": width, "height": height})
+    page.locator("#panel-tune").evaluate("panel => panel.scrollTo(0, 0)")
     assert page.evaluate(IN_VIEW) >= least
     sliders = page.locator("#tune-rows input[type=range]:visible")
 
