@@ -87,7 +87,7 @@ export const ACTIONS = [
   ["Clear the selection; close the overlay of the scene", "esc", "Escape", leave],
   ["Layout: exchange map and scene", "x", "x", exchange, "exchange map and scene"],
   ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],
-  ...["Monitor", "Tune", "Annotate", "Results"].map((name) => [`Layout: ${name}`, `shift ${name[0].toLowerCase()}`, name[0], () => useLayout(name), `the layout ${name}`, "standard sizes places arrange"]),
+  ...["Monitor", "Tune", "Annotate", "Results"].map((name) => [`Layout: ${name}`, `shift ${name[0]}`, name[0], () => useLayout(name), `the layout ${name}`, "standard sizes places arrange"]),
   ["Settings: theme, large controls, sound and vibration", "", "", showSheet, null, "options preferences gloves touch tablet contrast sunlight alarm warning mute"],
   ["Settings and keyboard shortcuts", "?", "?", showSheet, null, "help keys hotkeys manual"],
 ];
