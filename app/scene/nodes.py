@@ -275,6 +275,10 @@ class Segments(Node[viser.LineSegmentsHandle]):
         drawn = np.repeat(colours.of_lines(one_each), 2, axis=0).reshape(-1, 2, 3)
         self.update(on and len(segments) > 0, points=segments.astype(np.float32), colors=drawn)
 
+    def _send(self, content: dict[str, Any], changed: list[str]) -> None:  # noqa: ARG002 - see the base class
+        """Send points and colours together, because there are as many colours as points."""
+        send_properties(self.node, content)
+
 
 class Circles(Segments):
     """Circles at a height above the ground.
