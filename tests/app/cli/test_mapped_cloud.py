@@ -87,9 +87,9 @@ def test_the_page_writes_the_same_bytes_and_refuses_a_live_run(tmp_path, capsys)
     run = tmp_path / "run"
     assert stemmap(capsys, "map", "sim:stand?duration=2", "--out", run).code == 0
     assert stemmap(capsys, "export", run, "--to", tmp_path / "line.laz").code == 0
-    assert cloud({"path": str(run), "file": str(tmp_path / "page.laz")}) == {}
-    assert (tmp_path / "page.laz").read_bytes() == (tmp_path / "line.laz").read_bytes()
+    assert cloud({"path": str(run), "folder": str(tmp_path)}) == {"file": str(tmp_path / "cloud.laz")}
+    assert (tmp_path / "cloud.laz").read_bytes() == (tmp_path / "line.laz").read_bytes()
     record = run / "run.json"
     record.write_text(record.read_text().replace("sim:stand?duration=2", "zenoh:tcp/127.0.0.1:7447"))
     with pytest.raises(StemmapError, match="a live run has no recording"):
-        cloud({"path": str(run), "file": str(tmp_path / "live.laz")})
+        cloud({"path": str(run), "folder": str(tmp_path)})
