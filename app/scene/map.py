@@ -176,11 +176,13 @@ class MapNodes:
 
 class TreeFeet:
     """Heights of the feet of trees: that of the terrain, and where none is known there, of the lowest point
-    of the tree in all scans so far: of those in clusters, without any of all points around it."""
+    of the tree in the scans shown so far: of those in clusters, without any of all points around it. An
+    earlier scan, and the same one with other results, begins anew."""
 
     def __init__(self) -> None:
+        self._frame: Frame | None = None  # of the last call
         # By number of the tree: its place, the height of that point, and whether it is of a cluster.
-        self._lowest: dict[int, tuple[Float, float, bool]] = {}
+        self._lowest: dict[int, tuple[tuple[float, float], float, bool]] = {}
 
     def heights(self, frame: Frame, trees: Trees, ground: GroundNode) -> Float:
         """Return the height of the foot of each tree, shape (T,) [m]; without terrain and points that of the
@@ -194,7 +196,10 @@ class TreeFeet:
         foot = ground.heights(trees.position, np.nan)
         unknown = np.isnan(foot)
         if unknown.any():
-            foot[unknown] = self._of_points(frame, rows_of(trees, unknown))
+            if frame is not self._frame:
+                self._add(frame, rows_of(trees, unknown))
+            numbers = trees.number[unknown].tolist()
+            foot[unknown] = [self._lowest.get(number, _NO_FOOT)[1] for number in numbers]
             known = np.isfinite(foot)
             if not known.any():
                 return np.full(len(foot), frame.base_z)
@@ -206,19 +211,21 @@ class TreeFeet:
             foot[~known] = foot[known][nearest]
         return foot
 
-    def _of_points(self, frame: Frame, trees: Trees) -> Float:
-        """Return the height of the lowest point of each tree in this scan and the ones before, shape (T,)
-        [m]; NaN without points."""
-        for row, number in enumerate(trees.number.tolist()):
+    def _add(self, frame: Frame, trees: Trees) -> None:
+        """Add the points of a scan to the feet of trees."""
+        if self._frame is not None and frame.index <= self._frame.index:
+            self._lowest.clear()
+        self._frame = frame
+        for place, number in zip(trees.position, trees.number.tolist(), strict=True):
             # Another run of the same source numbers its trees anew.
-            place = self._lowest.get(number, (trees.position[row], np.nan, False))[0]
-            if math.dist(place, trees.position[row]) > OWN_TREE:
+            if number in self._lowest and math.dist(self._lowest[number][0], place) > OWN_TREE:
                 del self._lowest[number]
         self._take(trees, scan_in_map(frame, frame.filtered[frame.labels >= 0]), clustered=True)
-        never = np.array([number not in self._lowest for number in trees.number.tolist()])
-        if never.any():
-            self._take(rows_of(trees, never), scan_in_map(frame, frame.raw), clustered=False)
-        return np.array([self._lowest.get(number, NO_FOOT)[1] for number in trees.number.tolist()])
+        is_clustered = [self._lowest.get(number, _NO_FOOT)[2] for number in trees.number.tolist()]
+        if not all(is_clustered):
+            self._take(
+                rows_of(trees, ~np.array(is_clustered)), scan_in_map(frame, frame.raw), clustered=False
+            )
 
     def _take(self, trees: Trees, points: NDArray[np.float32], *, clustered: bool) -> None:
         """Lower the feet to points in the map, shape (N, 3) [m], that are at most OWN_TREE from a tree."""
@@ -229,12 +236,13 @@ class TreeFeet:
         low = np.full(len(trees.number), np.inf)
         np.minimum.at(low, row[near], points[near, 2])
         for k in np.flatnonzero(np.isfinite(low)).tolist():
-            number, z = int(trees.number[k]), float(low[k])
-            _, before, same = self._lowest.get(number, NO_FOOT)
-            self._lowest[number] = trees.position[k], min(z, before) if same else z, clustered
+            number, z, (x, y) = int(trees.number[k]), float(low[k]), trees.position[k].tolist()
+            _, before, was_clustered = self._lowest.get(number, _NO_FOOT)
+            is_same = math.isfinite(before) and was_clustered == clustered
+            self._lowest[number] = (x, y), min(z, before) if is_same else z, clustered
 
 
-NO_FOOT = (np.zeros(2), np.nan, False)
+_NO_FOOT = ((0.0, 0.0), math.nan, False)
 
 
 def tree_labels(

@@ -247,7 +247,8 @@ def cluster_labels(
         return []
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     base = clusters.centroid + frame.sensor_offset
-    tops = frame.base_z + base[:, 2] + 0.5 * shown_height(clusters.extent[:, 2]) + 0.1
+    ends = bases(frame) + shown_height(clusters.extent[:, 2])
+    tops = frame.base_z + frame.sensor_offset[2] + ends + 0.1
     places = np.column_stack([pose.apply(base[:, :2]), tops])
     order = np.lexsort((np.linalg.norm(base[:, :2], axis=1), clusters.verdict != Verdict.TREE))
     texts = [_cluster_text(frame, k, label_by) for k in range(len(order))]

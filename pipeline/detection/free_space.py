@@ -53,9 +53,9 @@ def widest_gap(bins: NDArray[np.uint16]) -> tuple[int, int]:
     lit = np.flatnonzero(np.bincount(bins, minlength=BINS))
     if not len(lit):
         return 0, 0
-    gaps = np.diff(lit, append=lit[0] + BINS) - 1
-    widest = int(gaps.argmax())
-    return int(lit[widest] + 1) % BINS, int(gaps[widest])
+    first, gaps = (lit + 1) % BINS, np.diff(lit, append=lit[0] + BINS) - 1
+    widest = np.lexsort((first, -gaps))[0]  # of equal ones that with the smallest first bin
+    return int(first[widest]), int(gaps[widest])
 
 
 @compiled

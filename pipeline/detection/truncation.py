@@ -145,5 +145,7 @@ def _touches(
 def _has_others(away: Float, reach: Float) -> Bool:
     """Return whether OTHERS or more returns at an edge have ranges `away`, shape (N,) [m], that differ by
     more than APART from each of `reach`, shape (M,) [m]; shape (M,)."""
-    others: Bool = (np.abs(reach[:, None] - away) > APART).sum(axis=1) >= OTHERS
+    ascending = np.sort(away)
+    near = np.searchsorted(ascending, reach + APART, "right") - np.searchsorted(ascending, reach - APART)
+    others: Bool = len(away) - near >= OTHERS
     return others

@@ -24,8 +24,8 @@ CELL = 0.5  # m
 KEPT = 8  # lowest returns of a cell
 TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
 PIT = 0.5  # m; a cell this far below its neighbours is noise
-AT_ONCE = 1_000_000  # points whose heights are computed at once, likewise
-BLOCK = 32  # columns of the raster whose neighbours are sorted at once, to bound the memory
+AT_ONCE = 1_000_000  # points whose heights are computed at once, to bound the memory
+BLOCK = 32  # columns of the raster whose neighbours are sorted at once, likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)

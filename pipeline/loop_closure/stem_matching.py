@@ -335,7 +335,7 @@ def crowding(pose: Float, local: Float, reference: Float, window: float) -> tupl
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     place = local @ np.array([[c, s], [-s, c]]) + pose[:2]
-    near = np.array([len(rows) for rows in cKDTree(reference).query_ball_point(place, window)])
+    near = cKDTree(reference).query_ball_point(place, window, return_length=True)
     return float(near.sum() / (len(local) * np.pi * window * window)), int(np.count_nonzero(near))
 
 

@@ -202,7 +202,9 @@ def agreement(
         mean: Positions of the landmarks, shape (L, 2) [m].
         covariance: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2].
     """
-    place, own, added = in_map(centre, R[:, [0, 1, 1, 2]].reshape(-1, 2, 2), pose, pose_covariance)
+    place, own, added = in_map(
+        centre, np.ascontiguousarray(R[:, [0, 1, 1, 2]]).reshape(-1, 2, 2), pose, pose_covariance
+    )
     expected = (own + added).reshape(-1, 1, 4)[:, :, [0, 1, 3]]  # of each detection
     y0, y1 = np.moveaxis(mean - place[:, None], 2, 0)
     S0, S1, S2 = np.moveaxis(expected + covariance, 2, 0)

@@ -28,7 +28,7 @@ class SlamState:
         motion: Motion by odometry since the last used scan, shape (3,).
         motion_covariance: Covariance of `motion`, shape (3, 3).
         slack: Sum of the slack of position [m] and heading [rad] of the odometry since trees or a measured
-            pose last determined the pose, shape (2,), see `motion.advanced`.
+            pose last determined the pose, shape (2,), see `motion.accumulated`.
         since_update: Distance driven since the last used scan [m], with 1 m per radian of rotation.
         detections: Number of detections in all scans so far; the next detection gets this birth number.
         views: Number of scans whose detections were used.

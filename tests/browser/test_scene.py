@@ -150,7 +150,7 @@ def wide(dashboard: Dashboard) -> Iterator[Dashboard]:
     """A window with room for the panel of the scene."""
     size = dashboard.page.viewport_size
     dashboard.tab("Trees")
-    dashboard.page.set_viewport_size({"width": 1640, "height": 720})
+    dashboard.page.set_viewport_size({"width": 1640, "height": 1300})
     yield dashboard
     assert size is not None
     dashboard.page.set_viewport_size(size)
@@ -383,8 +383,8 @@ def large_scene(dashboard: Dashboard) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("large_scene")
-def test_a_click_on_a_cluster_shows_why_it_is_not_a_tree(dashboard: Dashboard):
-    page = dashboard.page
+def test_a_click_on_a_cluster_shows_why_it_is_not_a_tree(wide: Dashboard):
+    dashboard, page = wide, wide.page
     dashboard.tab("Trees")
     scan = dashboard.ask("/api/status")["scan_index"]
     dashboard.until_server("/api/story/cluster/0", f"it.scan === {scan}")
@@ -400,9 +400,8 @@ def test_a_click_on_a_cluster_shows_why_it_is_not_a_tree(dashboard: Dashboard):
         if any(hypot(x - u, y - v) < APART for u, v in others):
             continue
         # Not below viser's own panel and notices.
-        if not (
-            box["x"] + 20 < x < box["x"] + box["width"] - 360 and 250 < y < box["y"] + box["height"] - 30
-        ):
+        left, top, width, height = (box[side] for side in ("x", "y", "width", "height"))
+        if not (left + 20 < x < left + width - 360 and top + 60 < y < top + height - 30):
             continue
         wanted = f"cluster {scan} {cluster}"
         dashboard.click_until(x, y, lambda: panel.get_attribute("data-story"), wanted)

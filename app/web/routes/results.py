@@ -39,6 +39,7 @@ from app.web.routes.access import Bounds, Dash, ViewerTurn, in_thread
 from app.worker.course import MOST_ROWS, QUANTITIES
 from app.worker.protocol import Shown
 from pipeline.config import Parameters
+from pipeline.errors import StemmapError
 from pipeline.io.block_file import LARGE
 
 router = APIRouter(prefix="/api")
@@ -112,7 +113,7 @@ def folder_of_export() -> Iterator[FilePath]:
 async def export_cloud(dashboard: Dash, there: Annotated[FilePath, Depends(folder_of_export)]) -> Response:
     """Return the cloud of the run as LAZ, see `app.batch.mapped_cloud.write_cloud`; a child process reads the
     source again. Only for owners. 409 before the first map; 422 if the source cannot be read."""
-    return await exported_file(ShownRun.of(dashboard), {"ask": "cloud"}, there)
+    return await exported_file(dashboard, ShownRun.of(dashboard), {"ask": "cloud"}, there)
 
 
 @router.get("/export/{suffix}", dependencies=[ViewerTurn])
@@ -124,18 +125,24 @@ async def export(
     """Return the map as a file for geographic information systems, in the reference system of the map; a
     child process writes it. For a run of scans, the bytes are those of `stemmap export` for a run with the
     same map. 409 before the first map; 422 if a package is missing."""
-    return await exported_file(ShownRun.of(dashboard), {"ask": "export", "suffix": f".{suffix}"}, there)
+    question = {"ask": "export", "suffix": f".{suffix}"}
+    return await exported_file(dashboard, ShownRun.of(dashboard), question, there)
 
 
-async def exported_file(run: ShownRun, question: dict[str, Any], there: FilePath) -> Response:
-    """Return the file that a child process exports. Its answer has the path of the file as `file`; the
-    question is extended by the folder of the run, "path", and the empty folder of the file, "folder". 422 if
-    the child reports an error."""
+async def exported_file(
+    dashboard: Dashboard, run: ShownRun, question: dict[str, Any], there: FilePath
+) -> Response:
+    """Return the file that a child process exports, one at a time. Its answer has the path of the file as
+    `file`; the question is extended by the folder of the run, "path", and the empty folder of the file,
+    "folder". 422 if the child reports an error or takes too long."""
     with as_bad_request():
-        async with in_thread(run.folder()) as folder:
-            answer = await opening.ask(
-                {**question, "path": str(folder), "folder": str(there)}, patience_s=_EXPORT_S
-            )
+        async with dashboard.exporting, in_thread(run.folder()) as folder:
+            try:
+                answer = await opening.ask(
+                    {**question, "path": str(folder), "folder": str(there)}, patience_s=_EXPORT_S
+                )
+            except opening.TookTooLongError:
+                raise StemmapError(f"the export takes longer than {_EXPORT_S:.0f} s") from None
     file = FilePath(answer["file"])
     return FileResponse(
         file, 200, {"Cache-Control": "no-store"}, "application/octet-stream", filename=file.name
@@ -146,18 +153,19 @@ async def exported_file(run: ShownRun, question: dict[str, Any], there: FilePath
 async def layer(layer: Literal["trees", "path"], dashboard: Dash) -> Response:
     """Return the trees or the path of the present map as GeoJSON for other programs, which ask again to be up
     to date: in WGS84, or in the frame of a local map. 409 before the first map."""
-    from app.batch import export
-
-    text_of = {"trees": export.trees_geojson, "path": export.path_geojson}[layer]
-
-    def written(run: ShownRun) -> str:
-        with run.folder() as folder:
-            return text_of(export.read_for_export(folder))
-
     run = ShownRun.of(dashboard)
     with as_bad_request():
-        text = await asyncio.to_thread(written, run)
+        text = await asyncio.to_thread(_layer_text, run, layer)
     return text_reply(text, f"{layer}.geojson", "application/geo+json")
+
+
+def _layer_text(run: ShownRun, layer: Literal["trees", "path"]) -> str:
+    """Return a layer of a run as GeoJSON."""
+    from app.batch import export
+
+    with run.folder() as folder:
+        exported = export.read_for_export(folder)
+    return export.trees_geojson(exported) if layer == "trees" else export.path_geojson(exported)
 
 
 @router.get("/evaluation")
@@ -247,9 +255,11 @@ async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
 @router.get("/camera/tree/{number}.jpg", dependencies=[ViewerTurn])
 async def tree_picture(number: Number, dashboard: Dash, shown: NewestScan) -> Response:
     """Return the part of the camera picture that shows a tree best, as JPEG; an empty answer (204) if no
-    picture shows it, 409 before the first map, 503 if the worker is busy."""
+    picture shows it, also without a usable camera, 409 before the first map, 503 if the worker is busy."""
     try:
         content = await dashboard.camera.tree(number, shown.frame.trees, dashboard.path)
+    except NothingMappedError:  # another source was opened meanwhile
+        raise
     except NoStoryError:  # usual for a tree behind the camera; browsers would log 404 as an error
         return Response(status_code=204)
     return bytes_reply(content, "image/jpeg")

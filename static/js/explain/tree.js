@@ -42,7 +42,7 @@ function overview(story, showCluster) {
 
 function missingDbh({ coverage_deg, dbh_arc_deg }) {
   if (coverage_deg < dbh_arc_deg) return `The DBH needs ${figure(dbh_arc_deg)}° of the circumference.`;
-  return "Its views do not tell the DBH well enough (Maximum sigma of DBH): pass it closer.";
+  return "The DBH is not measured: fewer than three fits, returns too far apart, or a standard deviation above the maximum.";
 }
 
 // The observed sides as arcs around the trunk; x of the map to the right.

@@ -6,7 +6,7 @@ import { capital } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { parametersText } from "../playback/timeline.js";
 import { ofExtensions } from "../shell/extensions.js";
-import { completion, listPlaces, nearMisses, sift } from "./places.js";
+import { completion, isListed, listPlaces, nearMisses, sift } from "./places.js";
 import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
@@ -97,7 +97,7 @@ function say(text) {
   const error = byId("source-error");
   setText(error, capital(text));
   error.hidden = !text;
-  const near = text ? nearMisses(path()) : [];
+  const near = text && !isListed(path()) ? nearMisses(path()) : [];
   byId("source-near").hidden = !near.length;
   byId("source-near").replaceChildren("Did you mean ", ...near.flatMap((uri, k) => [k ? ", " : "", el("button", { class: "link", type: "button", text: uri, onclick: () => choose(uri) })]), "?");
 }
@@ -112,9 +112,10 @@ export function startSources() {
   const field = byId("source-uri");
   field.addEventListener("input", show);
   field.addEventListener("keydown", (event) => { // completes the path, as in a terminal
-    if (event.key !== "Tab" || event.shiftKey || !completion() || completion() === path()) return;
+    const wanted = completion();
+    if (event.key !== "Tab" || event.shiftKey || !wanted) return;
     event.preventDefault();
-    field.value = completion();
+    field.value = wanted;
     show();
   });
   const choices = [...ofExtensions("sourceChoice").map(({ node }) => node), byId("source-motion")];

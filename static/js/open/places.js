@@ -12,7 +12,7 @@ let entries = []; // {uri, node, words}
 
 // `choose(uri, title)` opens a place.
 export async function listPlaces(choose) {
-  const [{ scenarios, recordings }, { runs }] = await Promise.all([get("/api/sources"), get("/api/runs")]);
+  const [{ scenarios, recordings }, { runs }] = await Promise.all([get("/api/sources"), get("/api/runs").catch(() => ({ runs: [] }))]);
   entries = [];
   const entry = (uri, title, doc, address = () => uri) => {
     const node = el("button", { type: "button", title: uri, onclick: () => choose(address()) }, el("b", { text: title }), el("span", { text: doc }));
@@ -74,8 +74,14 @@ export function sift() {
   setText(none, "Nothing listed here has these words. Press Open for a path or an address of your own.");
 }
 
-// The first entry that is shown while something is typed; null if none is.
-export const completion = () => (byId("source-uri").value.trim() && entries.find(({ node }) => !node.hidden)?.uri) || null;
+// The first address that begins with what is typed, ignoring case; null if there is none or it is typed completely.
+export function completion() {
+  const typed = byId("source-uri").value.trim().toLowerCase();
+  if (!typed || isListed(typed)) return null;
+  return entries.find(({ uri }) => uri.toLowerCase().startsWith(typed))?.uri ?? null;
+}
+
+export const isListed = (text) => entries.some(({ uri }) => uri.toLowerCase() === text.toLowerCase());
 
 const pairs = (text) => new Set([...text].slice(1).map((letter, k) => text[k] + letter));
 

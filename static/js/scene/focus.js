@@ -46,6 +46,8 @@ export function startFocus() {
   on("selection", onSelection);
   onSceneLoad((inner) => {
     scene = inner;
-    inner.addEventListener("pointerdown", () => { clickedAt = performance.now(); }, { capture: true });
+    inner.addEventListener("pointerdown", ({ target }) => { // not in viser's panel
+      if (target.tagName === "CANVAS") clickedAt = performance.now();
+    }, { capture: true });
   });
 }

@@ -66,9 +66,10 @@ const LEAST_WIDTH = 560; // [px] of the scene with its panel
 function collapse() {
   const wanted = visible("tune") || narrow.matches || !isDrive() || byId("scene").clientWidth < LEAST_WIDTH;
   if (!inner || wanted === collapsed) return;
+  const isDocked = inner.querySelector("[data-dock-region]"); // else a sheet at the bottom, in a small scene
   const named = (word) => inner.querySelector(`[data-dock-region] [aria-label^="${word}"]`);
-  const sheet = phone.matches && inner.querySelector('.mantine-Paper-root [style*="cursor: pointer"][style*="height: 3.5em"]');
-  const button = sheet || named(wanted ? "Collapse" : "Expand");
+  const button = isDocked ? named(wanted ? "Collapse" : "Expand")
+    : inner.querySelector('.mantine-Paper-root [style*="cursor: pointer"][style*="height: 3.5em"]');
   if (!button && !named(wanted ? "Expand" : "Collapse")) return; // not built yet
   button?.click();
   button?.blur();

@@ -9,7 +9,7 @@ import { attempt, isTuning } from "./parameters.js";
 
 const MOST = 30; // lines of the list
 const SIGNS = { appeared: "+", vanished: "−", moved: "→" };
-let begun = []; // [share, time [s]] of the re-mapping in the last PACE seconds, the oldest first
+let reached = []; // [share, time [s]] of the re-mapping, the oldest first
 const progress = el("progress", { id: "tune-progress", max: "1", hidden: true, "aria-label": "Progress of the re-mapping" });
 const note = el("p", { id: "tune-whole-status", class: "note dim", role: "status" });
 const list = el("ul", { id: "tune-changes" });
@@ -27,7 +27,8 @@ function resultText(remapped) {
   const { after, scans, time_s: end, changes } = remapped;
   const number = (kind) => changes.filter((change) => change.kind === kind).length;
   const parts = Object.keys(SIGNS).map((kind) => number(kind) && `${number(kind)} ${kind}`).filter(Boolean);
-  return `Re-mapped${endText(scans, end)}: ${count(after, "tree")}, ${parts.length ? parts.join(", ") : `the same as before. ${WHY_SAME[state.parameters?.values["classification.method"]] ?? ""}`}`;
+  const same = `the same as before. ${WHY_SAME[state.parameters?.values["classification.method"]] ?? ""}`;
+  return `Re-mapped${endText(scans, end)}: ${count(after, "tree")}, ${parts.length ? `${parts.join(", ")}.` : same.trimEnd()}`;
 }
 
 // The re-mapping ends at the current scan; later scans are mapped when the run reaches them.
@@ -38,15 +39,16 @@ function endText(scans, end) {
 }
 
 const PACE = 6; // [s] of which the pace counts; at the beginning kernels are loaded and the current scan is mapped
+const MEASURED = 0.02; // least share of the run from which the pace is computed
 
 // The estimated time left as text; empty while the pace is not known.
 function left(share) {
   const now = performance.now() / 1000;
-  if (share < (begun.at(-1)?.[0] ?? 0)) begun = [];
-  begun.push([share, now]);
-  while (begun.length > 2 && begun[0][1] < now - PACE) begun.shift();
-  const [[before, then]] = begun;
-  if (now - then < PACE / 2 || share - before < 0.02) return "";
+  if (share < (reached.at(-1)?.[0] ?? 0)) reached = [];
+  reached.push([share, now]);
+  while (reached.length > 2 && reached[1][1] < now - PACE && share - reached[1][0] >= MEASURED) reached.shift();
+  const [[before, then]] = reached;
+  if (now - then < PACE / 2 || share - before < MEASURED) return "";
   return `, about ${roughly(((now - then) * (1 - share)) / (share - before))} left`;
 }
 
@@ -60,7 +62,7 @@ function show() {
   const share = state.status?.remapped ?? null;
   const preview = share !== null && state.rough?.revision === state.parameters?.revision ? state.rough : null;
   const newest = share === null && state.remapped?.revision !== state.parameters?.revision ? null : state.remapped; // else a parameter changed since then
-  if (share === null) begun = [];
+  if (share === null) reached = [];
   box.checked = state.parameters?.whole ?? true;
   progress.hidden = share === null;
   all.hidden = !newest || !newest.changes.length;

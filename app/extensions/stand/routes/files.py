@@ -20,7 +20,7 @@ from app.extensions.stand.plots import SamplePlot
 from app.extensions.stand.questions import EXPORT, REPORT
 from app.extensions.stand.routes.figure_parameters import FigureParameters
 from app.sources import opening
-from app.web.responses import bytes_reply, text_reply
+from app.web.responses import as_bad_request, bytes_reply, text_reply
 from app.web.routes.access import Dash, Deployment, ViewerTurn
 from app.web.routes.results import exported_file, folder_of_export
 from app.web.routes.runs import Key, is_open_run, run_folder
@@ -36,7 +36,8 @@ async def plots_layer(dashboard: Dash) -> Response:
     """Return the plots of the run as GeoJSON, in the coordinates of the other layers. 409 before the first
     map."""
     run = ShownRun.of(dashboard)
-    text = await asyncio.to_thread(_plots_geojson, run)
+    with as_bad_request():
+        text = await asyncio.to_thread(_plots_geojson, run)
     return text_reply(text, "plots.geojson", "application/geo+json")
 
 
@@ -65,7 +66,7 @@ def _add_export(suffix: str) -> None:
     ) -> Response:
         run = ShownRun.of(dashboard)
         question = {"ask": EXPORT, "suffix": f".{suffix}", **_of_plots(plots_of_run(run), parameters)}
-        return await exported_file(run, question, there)
+        return await exported_file(dashboard, run, question, there)
 
 
 # The GeoPackage has plots, in place of that of the program.
