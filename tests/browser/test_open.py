@@ -36,7 +36,7 @@ def page(chromium: Browser, folder: Path, extensions: str) -> Iterator[Page]:
         Server(SOURCE, STEMMAP_FOLDER=str(folder.parent), STEMMAP_EXTENSIONS=extensions) as server,
         opened(chromium, server.link) as made,
     ):
-        made.until_server("/api/runs", "it.runs.length === 1")
+        made.until_server("/api/runs", "it.runs.length >= 1")
         made.pause()
         yield made.page
 
@@ -87,12 +87,12 @@ def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extension
     if extensions:
         expect(dialog.locator("#source-cloud")).to_be_visible()
     runs = dialog.evaluate("async () => (await (await fetch('/api/runs')).json()).runs.length")
-    assert runs == 1
+    assert runs >= 1  # those of the other server are in the same folder
     address = dialog.url
     dialog.goto(address.split("?")[0] + "runs")
-    expect(dialog.locator("#runs tbody tr")).to_have_count(1)
-    assert dialog.locator("#runs input[type=checkbox]").count() == (1 if extensions else 0)
+    expect(dialog.locator("#runs tbody tr")).to_have_count(runs)
+    assert dialog.locator("#runs input[type=checkbox]").count() == (runs if extensions else 0)
     heads = dialog.locator("#runs thead tr > *").count()
-    assert dialog.locator("#runs tbody tr > *").count() == heads
+    assert dialog.locator("#runs tbody tr > *").count() == runs * heads
     dialog.goto(address)
     dialog.locator("#source-button").click()

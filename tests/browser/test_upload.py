@@ -71,7 +71,7 @@ def test_a_dropped_recording_is_opened_and_a_picture_is_refused(
     dashboard.until_server("/api/status", "it.state === 'finished'")
     dashboard.until(AT_THE_END)
     page.locator("#source-button").click()
-    expect(page.locator("#source-list").get_by_text("north stand.mcap")).to_be_visible()
+    expect(page.locator("#source-list").get_by_text("north stand.mcap").first).to_be_visible()
     page.keyboard.press("Escape")
 
 
