@@ -149,6 +149,7 @@ def test_a_press_on_a_slider_changes_nothing_and_a_drag_is_one_step(dashboard: D
 def wide(dashboard: Dashboard) -> Iterator[Dashboard]:
     """A window with room for the panel of the scene."""
     size = dashboard.page.viewport_size
+    dashboard.load_scene()
     dashboard.tab("Trees")
     dashboard.page.set_viewport_size({"width": 1640, "height": 1300})
     yield dashboard

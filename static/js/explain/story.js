@@ -8,7 +8,7 @@ import { capital } from "../core/format.js";
 import { selectCluster } from "../core/live_feed.js";
 import { on, selectedTree, state } from "../core/store.js";
 import { throttled } from "../core/timing.js";
-import { onSceneLoad } from "../scene/scene.js";
+import { onScenePress } from "../scene/scene.js";
 import { openTab, visible } from "../shell/tabs.js";
 import { clusterStory, clusterTitle } from "./cluster.js";
 import { treeStory } from "./tree.js";
@@ -161,5 +161,5 @@ export function startStory() {
   });
   on("tab", () => show());
   on("missing", onMissing);
-  onSceneLoad((inner) => inner.addEventListener("pointerdown", () => { clickedAt = performance.now(); }, { capture: true }));
+  onScenePress(() => { clickedAt = performance.now(); });
 }

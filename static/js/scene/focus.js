@@ -3,7 +3,7 @@
 
 import { byId, recall, remember } from "../core/dom.js";
 import { isPlaying, on, state } from "../core/store.js";
-import { onSceneLoad } from "./scene.js";
+import { onSceneLoad, onScenePress } from "./scene.js";
 
 const NEAR = 12; // [m] largest distance from the selection after a flight
 const HEIGHT = 1.3; // [m] of the place that the camera looks at, above the ground
@@ -44,10 +44,6 @@ export function startFocus() {
   button.setAttribute("aria-pressed", String(recall("focus") !== "off"));
   button.addEventListener("click", toggleFocus);
   on("selection", onSelection);
-  onSceneLoad((inner) => {
-    scene = inner;
-    inner.addEventListener("pointerdown", ({ target }) => { // not in viser's panel
-      if (target.tagName === "CANVAS") clickedAt = performance.now();
-    }, { capture: true });
-  });
+  onSceneLoad((inner) => { scene = inner; });
+  onScenePress(() => { clickedAt = performance.now(); });
 }

@@ -11,6 +11,9 @@ const POINT_PX = [1.5, 8]; // [px] smallest and largest diameter of a point
 const NOTICE_MS = 8000, LOOK_MS = 250, LOOKS = 40;
 
 export const onSceneLoad = (listener) => loaders.push(listener);
+// A press in the picture of the scene, not in viser's panel.
+export const onScenePress = (listener) => onSceneLoad((inner) => inner.addEventListener("pointerdown",
+  ({ target }) => { if (target.tagName === "CANVAS") listener(); }, { capture: true }));
 export const onSceneBuilt = (listener) => builders.push(listener); // once its nodes and camera are there
 
 function address() {
