@@ -67,6 +67,10 @@ def test_what_is_typed_filters_and_tab_completes(dialog: Page, folder: Path) -> 
     expect(shown).to_contain_text("south stand.pcap")
     field.press("Tab")
     expect(field).to_have_value(str(folder / "spring" / "south stand.pcap"))
+    field.fill("sim:stand")  # an address that others begin with
+    field.press("Tab")
+    expect(field).to_have_value("sim:stand")
+    expect(field).not_to_be_focused()
     field.fill("nothing like it")
     expect(dialog.locator("#source-none")).to_be_visible()
 

@@ -74,11 +74,13 @@ export function sift() {
   setText(none, "Nothing listed here has these words. Press Open for a path or an address of your own.");
 }
 
-// The first address that begins with what is typed, ignoring case; null if there is none or it is typed completely.
+// The first address that begins with what is typed, else the only one that is shown; null if there is none or it is typed
+// completely.
 export function completion() {
   const typed = byId("source-uri").value.trim().toLowerCase();
   if (!typed || isListed(typed)) return null;
-  return entries.find(({ uri }) => uri.toLowerCase().startsWith(typed))?.uri ?? null;
+  const shown = [...new Set(entries.filter(({ node }) => !node.hidden).map(({ uri }) => uri))];
+  return shown.find((uri) => uri.toLowerCase().startsWith(typed)) ?? (shown.length === 1 ? shown[0] : null);
 }
 
 export const isListed = (text) => entries.some(({ uri }) => uri.toLowerCase() === text.toLowerCase());
