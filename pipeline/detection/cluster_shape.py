@@ -62,6 +62,7 @@ def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
     return centroid, eigenvalues, extent
 
 
+@compiled
 def spread_about(points: Float, bounds: Int, centre: Float) -> Float:
     """Return the standard deviation of the horizontal distances of the points of each cluster to a centre,
     shape (K,) [m].
@@ -71,10 +72,17 @@ def spread_about(points: Float, bounds: Int, centre: Float) -> Float:
         bounds: First row of each cluster, and N, shape (K + 1,); no cluster is empty.
         centre: Centres of the clusters, x, y first, shape (K, 2 or 3) [m].
     """
-    away = points[:, :2] - np.repeat(centre[:, :2], np.diff(bounds), axis=0)
-    d, cluster = np.hypot(*away.T), np.repeat(np.arange(len(centre)), np.diff(bounds))
-    mean, square = (np.bincount(cluster, v, len(centre)) / np.diff(bounds) for v in (d, d * d))
-    spread: Float = np.sqrt(np.maximum(square - mean * mean, 0.0))
+    clusters = bounds.shape[0] - 1
+    spread = np.zeros(clusters)
+    for k in range(clusters):
+        n = bounds[k + 1] - bounds[k]
+        total, squares = 0.0, 0.0
+        for i in range(bounds[k], bounds[k + 1]):
+            d = np.hypot(points[i, 0] - centre[k, 0], points[i, 1] - centre[k, 1])
+            total += d
+            squares += d * d
+        mean = total / n
+        spread[k] = np.sqrt(max(squares / n - mean * mean, 0.0))
     return spread
 
 
@@ -186,6 +194,7 @@ def describe(
     )
 
 
+@compiled
 def eccentricity(eigenvalues: Float) -> Float:
     """Return the eccentricity e = lambda1 / lambda2 (Eq. 4) of each cluster, shape (K,).
 
@@ -195,9 +204,14 @@ def eccentricity(eigenvalues: Float) -> Float:
     Args:
         eigenvalues: Descending eigenvalues, shape (K, 2 or 3) [m^2].
     """
-    first, second = eigenvalues[:, 0], eigenvalues[:, 1]
-    ratio = np.where(first > FLAT, np.inf, 1.0)
-    return np.divide(first, second, out=ratio, where=second > FLAT * np.maximum(first, 1.0))
+    ratio = np.ones(eigenvalues.shape[0])
+    for k in range(eigenvalues.shape[0]):
+        first, second = eigenvalues[k, 0], eigenvalues[k, 1]
+        if second > FLAT * max(first, 1.0):
+            ratio[k] = first / second
+        elif first > FLAT:
+            ratio[k] = np.inf
+    return ratio
 
 
 def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigma: float) -> Float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Float32
@@ -17,6 +18,7 @@ DENSE = 0.9
 FIELD = 10  # bins; a direction without a return within this distance may be outside of the field of view
 
 
+@compiled
 def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
     """Return the free distance from the base by direction in the base frame, shape (BINS,), in the order of
     `direction_bin` [m].
@@ -33,29 +35,43 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
     """
     bins = directions(raw, sensor_offset)
     looked = np.zeros(BINS, np.bool_)
-    looked[bins] = True
-    place = filtered[:, :2] + sensor_offset[:2]
+    for k in bins:
+        looked[k] = True
     free = np.full(BINS, np.inf)
-    np.minimum.at(free, directions(filtered, sensor_offset), np.sqrt((place * place).sum(axis=1)))
+    for i in range(filtered.shape[0]):
+        x, y = filtered[i, 0] + sensor_offset[0], filtered[i, 1] + sensor_offset[1]
+        k = direction_bin(x, y, BINS)
+        free[k] = min(free[k], np.sqrt(x * x + y * y))
     first, largest = widest_gap(bins)
     if np.count_nonzero(looked) >= DENSE * (BINS - largest):
-        free[(first + np.arange(largest)) % BINS] = 0.0
-    around = np.concatenate([looked[-FIELD:], looked, looked[:FIELD]])
-    free[~np.lib.stride_tricks.sliding_window_view(around, 2 * FIELD + 1).any(axis=1)] = 0.0
+        for k in range(first, first + largest):
+            free[k % BINS] = 0.0
+    for k in range(BINS):
+        near = False
+        for j in range(-FIELD, FIELD + 1):
+            near = near or looked[(k + j) % BINS]
+        if not near:
+            free[k] = 0.0
     # The edge of a trunk may be in either of two bins; the minimum over neighbouring bins is conservative.
-    safe: Float = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
+    safe = free.copy()
+    for k in range(BINS):
+        safe[k] = min(free[k], free[(k + 1) % BINS], free[k - 1])
     return safe
 
 
+@compiled
 def widest_gap(bins: NDArray[np.uint16]) -> tuple[int, int]:
     """Return the first bin and the length of the longest run of bins without a return, which may extend over
     the seam; length 0 for an empty scan. `bins` are the bins of the returns, see `directions`, shape (N,)."""
-    lit = np.flatnonzero(np.bincount(bins, minlength=BINS))
-    if not len(lit):
-        return 0, 0
-    first, gaps = (lit + 1) % BINS, np.diff(lit, append=lit[0] + BINS) - 1
-    widest = np.lexsort((first, -gaps))[0]  # of equal ones that with the smallest first bin
-    return int(first[widest]), int(gaps[widest])
+    lit = np.zeros(BINS, np.bool_)
+    for k in bins:
+        lit[k] = True
+    first, most, run = 0, 0, 0
+    for k in range(2 * BINS):  # two turns, so that a run across the seam counts once
+        run = 0 if lit[k % BINS] else run + 1
+        if most < run <= BINS:
+            first, most = k + 1 - run, run
+    return first % BINS, most if most < BINS else 0
 
 
 @compiled

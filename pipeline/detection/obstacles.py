@@ -12,7 +12,8 @@ import math
 import numpy as np
 
 from pipeline.config.stages import Obstacles
-from pipeline.ground.scan_ground import Terrain, heights_of_places
+from pipeline.ground.scan_ground import Terrain, ground_at
+from pipeline.jit import compiled
 from pipeline.types.records import Clearance, Float, Float32, Zone
 
 #: Below this speed [m/s] the robot counts as standing and its path is straight ahead.
@@ -119,6 +120,7 @@ def path_curvature(twist: tuple[float, float, float]) -> float:
     return min(max(turn / forward, -1.0 / TIGHTEST), 1.0 / TIGHTEST)
 
 
+@compiled
 def _find_obstacles(
     points: Float32,
     ground: Float,
@@ -150,51 +152,69 @@ def _find_obstacles(
         [m] from its sides up to BESIDE, infinite if there is no obstacle; x, y [m] of a return of the nearest
         obstacle on the path in the level base frame, NaN if there is none.
     """
-    reach, behind, half = robot.tolist()
-    stop, slow = zones.tolist()
+    reach, behind, half = robot[0], robot[1], robot[2]
+    stop, slow = zones[0], zones[1]
+    most = reach + slow
+    farthest = (most + half + BESIDE) ** 2
     way = -1.0 if backward else 1.0
-    place = points[:, :2] + sensor[:2]
-    looks = np.count_nonzero(np.abs(place[:, 1]) < way * _LOOKING * place[:, 0])
-    rows = np.flatnonzero((place * place).sum(axis=1) < (reach + slow + half + BESIDE) ** 2)  # not NaN
-    off = _lateral_distance(way * place[rows, 0], place[rows, 1], curvature)
-    rows, off = rows[off <= half + BESIDE], off[off <= half + BESIDE]  # most ground returns fail here
-    along = _arc_length(way * place[rows, 0], place[rows, 1], curvature)
-    on_way = (along > -behind) & (along <= reach + slow)
-    rows, off, along = rows[on_way], off[on_way], along[on_way]
-    height = points[rows, 2] + sensor[2]
-    if len(ground):
-        height = heights_of_places(points[rows].astype(np.float64), ground)
-    tall = (band[0] <= height) & (height <= band[1])
-    rows, off, along = rows[tall], off[tall], along[tall]
-    beside = _nearest(np.maximum(off - half, 0.0), least)
-    rows, along = rows[off <= half], np.maximum(along[off <= half] - reach, 0.0)
-    ahead = _nearest(along, least)
-    x, y = place[rows[along == ahead]][-1].tolist() if np.isfinite(ahead) else (math.nan, math.nan)
+    s, place, aside = np.empty(points.shape[0]), np.empty((points.shape[0], 2)), np.empty(points.shape[0])
+    n = near = looks = 0
+    for i in range(points.shape[0]):
+        x, y = points[i, 0] + sensor[0], points[i, 1] + sensor[1]
+        looks += abs(y) < way * x * _LOOKING
+        if not x * x + y * y < farthest:  # also false for NaN
+            continue
+        off = _lateral_distance(way * x, y, curvature)
+        if off > half + BESIDE:  # checked first: most ground returns fail here
+            continue
+        along = _arc_length(way * x, y, curvature)
+        if along <= -behind or along > most:
+            continue
+        height = points[i, 2] + sensor[2]
+        if ground.shape[0] > 0:
+            height = points[i, 2] - ground_at(ground, points[i, 0], points[i, 1])
+        if not band[0] <= height <= band[1]:
+            continue
+        aside[near] = max(off - half, 0.0)
+        near += 1
+        if off <= half:
+            s[n], place[n, 0], place[n, 1] = max(along - reach, 0.0), x, y
+            n += 1
+    beside = _nearest(aside[:near], least)
+    ahead = _nearest(s[:n], least)
+    at_x = at_y = np.nan
+    for i in range(n):
+        if s[i] == ahead:
+            at_x, at_y = place[i, 0], place[i, 1]
     zone = 2 if ahead < stop else (1 if ahead < slow else 0)
-    return 3 if zone == 0 and looks < least else zone, ahead, beside, x, y
+    if zone == 0 and looks < least:
+        zone = 3
+    return zone, ahead, beside, at_x, at_y
 
 
-def _lateral_distance(x: Float, y: Float, curvature: float) -> Float:
-    """Return the lateral distances, shape (N,) [m], of points x, y [m] from the arc through the origin that
-    begins along +x with a curvature [1/m], positive to the left."""
+@compiled
+def _lateral_distance(x: float, y: float, curvature: float) -> float:
+    """Return the lateral distance [m] of a point x, y [m] from the arc through the origin that begins along
+    +x with a curvature [1/m], positive to the left."""
     if abs(curvature) < STRAIGHT:
-        return np.abs(y)
+        return abs(y)
     radius = 1.0 / abs(curvature)
-    to_centre = radius - math.copysign(1.0, curvature) * y
-    return np.abs(radius - np.sqrt(x * x + to_centre * to_centre))
+    to_centre = radius - (y if curvature > 0.0 else -y)
+    return float(abs(radius - np.sqrt(x * x + to_centre * to_centre)))
 
 
-def _arc_length(x: Float, y: Float, curvature: float) -> Float:
-    """Return the arc lengths, shape (N,) [m], from the origin to the foot points of points x, y [m] on the
-    arc through the origin that begins along +x with a curvature [1/m], positive to the left; up to half a
-    turn is in front of the robot, the rest is negative."""
+@compiled
+def _arc_length(x: float, y: float, curvature: float) -> float:
+    """Return the arc length [m] from the origin to the foot point of a point x, y [m] on the arc through the
+    origin that begins along +x with a curvature [1/m], positive to the left; up to half a turn is in front of
+    the robot, the rest is negative."""
     if abs(curvature) < STRAIGHT:
         return x
     radius = 1.0 / abs(curvature)
-    along: Float = radius * np.arctan2(x, radius - math.copysign(1.0, curvature) * y)
-    return along
+    return float(radius * np.arctan2(x, radius - (y if curvature > 0.0 else -y)))
 
 
+@compiled
 def _nearest(values: Float, least: int) -> float:
     """Return the smallest of the values, shape (N,) [m], that starts a group of `least` values within DEPTH,
     or infinity if there is no such group.
@@ -202,6 +222,7 @@ def _nearest(values: Float, least: int) -> float:
     Fewer returns, such as rain or an insect, are not an obstacle.
     """
     ordered = np.sort(values)
-    starts = ordered[: max(len(ordered) - least + 1, 0)]
-    starts = starts[ordered[least - 1 :] - starts <= DEPTH]
-    return float(starts[0]) if len(starts) else math.inf
+    for i in range(ordered.shape[0] - least + 1):
+        if ordered[i + least - 1] - ordered[i] <= DEPTH:
+            return float(ordered[i])
+    return np.inf

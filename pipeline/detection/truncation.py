@@ -15,6 +15,7 @@ from pipeline.config.stages import Acquisition, Filters
 from pipeline.detection.free_space import BINS, directions, widest_gap
 from pipeline.geometry.azimuth_bins import bin_direction
 from pipeline.geometry.poses import Float
+from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int32, Labels, Sensor, UInt16
 
 SHOTS = 2.0  # a cluster within this many shots of a border is truncated
@@ -104,6 +105,7 @@ def _end(beside: Float32, c: float, s: float, side: float) -> tuple[float, Float
     return float(turn.max()), np.hypot(x, y)
 
 
+@compiled
 def _touches(
     points: Float32,
     label: Int32,
@@ -126,26 +128,32 @@ def _touches(
         least: Lower bound of the distance from a border within which a point is at the border [m].
         view: Field of view; its edges count only if it is less than 360 degrees.
     """
-    rows = np.flatnonzero(label >= 0)
-    x, y, z = points[rows].T.astype(np.float64)
-    reach = np.hypot(x, y)
-    away, step = np.hypot(reach, z), SHOTS * azimuth_step
-    borders = (x - box[0], box[1] - x, y - box[2], box[3] - y, away - ranges[0], ranges[1] - away)
-    at_border = np.minimum.reduce(borders) < np.maximum(step * reach, least)
-    if np.isfinite(view.left):
-        turn = np.arctan2(view.c * y - view.s * x, view.c * x + view.s * y)
-        for beside, at_edge in ((turn - view.right, view.at_right), (view.left - turn, view.at_left)):
-            near = np.flatnonzero(beside < step)
-            at_border[near] |= _has_others(at_edge, reach[near])
     cut = np.zeros(clusters, np.bool_)
-    cut[label[rows[at_border]]] = True
+    one_way = np.isfinite(view.left)
+    for i in range(points.shape[0]):
+        k = label[i]
+        if k < 0 or cut[k]:
+            continue
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        reach = np.sqrt(x * x + y * y)
+        away = np.sqrt(reach * reach + z * z)
+        near = max(SHOTS * azimuth_step * reach, least)
+        to_box = min(min(x - box[0], box[1] - x), min(y - box[2], box[3] - y))
+        cut[k] = min(to_box, min(away - ranges[0], ranges[1] - away)) < near
+        if one_way and not cut[k]:
+            turn = np.arctan2(view.c * y - view.s * x, view.c * x + view.s * y)
+            step = SHOTS * azimuth_step
+            cut[k] = (turn - view.right < step and _others(view.at_right, reach)) or (
+                view.left - turn < step and _others(view.at_left, reach)
+            )
     return cut
 
 
-def _has_others(away: Float, reach: Float) -> Bool:
+@compiled
+def _others(away: Float, reach: float) -> bool:
     """Return whether OTHERS or more returns at an edge have ranges `away`, shape (N,) [m], that differ by
-    more than APART from each of `reach`, shape (M,) [m]; shape (M,)."""
-    ascending = np.sort(away)
-    near = np.searchsorted(ascending, reach + APART, "right") - np.searchsorted(ascending, reach - APART)
-    others: Bool = len(away) - near >= OTHERS
-    return others
+    more than APART from `reach` [m]."""
+    others = 0
+    for d in away:
+        others += abs(d - reach) > APART
+    return others >= OTHERS
