@@ -176,8 +176,9 @@ class MapNodes:
 
 class TreeFeet:
     """Heights of the feet of trees: that of the terrain, and where none is known there, of the lowest point
-    of the tree in the scans shown so far: of those in clusters, without any of all points around it. An
-    earlier scan, and the same one with other results, begins anew."""
+    of the tree in the scans that were shown before. Points of clusters count; a tree without any takes all
+    points around it. When an earlier scan or other results of the same scan are shown, the heights of the
+    scans before are discarded."""
 
     def __init__(self) -> None:
         self._frame: Frame | None = None  # of the last call
@@ -217,7 +218,7 @@ class TreeFeet:
             self._lowest.clear()
         self._frame = frame
         for place, number in zip(trees.position, trees.number.tolist(), strict=True):
-            # Another run of the same source numbers its trees anew.
+            # The same number is another tree after the run was mapped again.
             if number in self._lowest and math.dist(self._lowest[number][0], place) > OWN_TREE:
                 del self._lowest[number]
         self._take(trees, scan_in_map(frame, frame.filtered[frame.labels >= 0]), clustered=True)

@@ -255,10 +255,10 @@ async function answer(tree, kind) {
     return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind } : { kind })
       : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null });
   });
-  const told = draft.answer;
+  const given = draft.answer;
   try {
     if (state.selected === number) await next();
-    if (!await stored && draft.answer === told) draft.answer = null; // not that of a later tree
+    if (!await stored && draft.answer === given) draft.answer = null; // not that of a later tree
   } finally {
     answering.delete(number);
     news();

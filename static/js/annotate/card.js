@@ -45,10 +45,10 @@ const refresh = keepFresh(async () => {
   if (version === shown) return;
   let points, votes = "", loaded = "";
   try {
-    const told = await story(number);
-    const [evidence] = ofExtensions("treeEvidence", told);
-    points = evidence ?? gatheredFigure(told);
-    if (!evidence) votes = columnFigure(told.column, "Votes on the accumulated scans");
+    const explanation = await story(number);
+    const [figures] = ofExtensions("treeEvidence", explanation);
+    points = figures ?? gatheredFigure(explanation);
+    if (!figures) votes = columnFigure(explanation.column, "Votes on the accumulated scans");
     loaded = version;
   } catch (error) {
     points = el("p", { class: "empty", text: capital(error.message) });

@@ -326,7 +326,7 @@ MIN_OWN_POINTS = 3  # points on the circle at the height of the slice itself, wh
 # Votes of the first circle; points with the noise of a mobile scanner have half a vote each.
 VOTES = MIN_POINTS / 2.0
 SAMPLED_COLUMNS = 32  # columns in which the cloud is measured
-CLEAR_CONTRAST = 10.0  # contrast of a circle with few points beside it
+CLEAR_CONTRAST = 10.0  # least contrast of a circle with few points around it; see `_contrast`
 BARK_SCATTER = 0.01  # m; a scatter down to this is bark, and not a property of the scanner
 MAX_SCATTER = 1.75  # largest scatter of a circle as a multiple of the noise; foliage around a stem adds to it
 UNROUND = 0.05  # scatter by the shape of a cross-section, as a share of the radius
