@@ -38,9 +38,11 @@ class Extension:
         help: What it adds, in one line.
         commands: Dotted module by the name of a command. The module has `HELP`, `configure(parser)` and
             `run(arguments)`, which returns the exit code.
-        takes: Dotted module by the name of a command of the program. The module has `configure(parser)`,
-            which adds flags, and `run(arguments)`, which returns the exit code, or None if the command shall
-            do the work. If it has `check(arguments)`, that is called before any `run` and may refuse them.
+        takes: Dotted module by the name of a command. The module has `configure(parser)`, which adds flags,
+            and `run(arguments)`, which returns the exit code, or None if the command shall do the work. If it
+            has `check(arguments)`, that is called before any `run`; it may refuse them, and set
+            `arguments.pool`, the `app.common.task_pool.TaskPool` in which the command computes its tasks.
+            The words of the command line are `arguments.words`.
         web: Adds routes to the application of a dashboard (`app.state.dashboard`, `app.state.settings`),
             which are tried before those of the program; coroutine functions in the list `app.state.closing`
             are called at its end.

@@ -109,6 +109,7 @@ def main(arguments: list[str] | None = None) -> int:
         if unknown:
             _refuse(unknown, parsed.command, known[parsed.command])
         command = importlib.import_module(commands()[parsed.command])
+        parsed.words = tuple(words)
         with _sigterm_as_ctrl_c():
             for taker in parsed.takers:
                 if hasattr(taker, "check"):
@@ -245,7 +246,7 @@ def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argpa
             takers = tuple(_takers(name))
             for taker in takers:
                 taker.configure(subparser)
-            subparser.set_defaults(takers=takers)
+            subparser.set_defaults(takers=takers, pool=None)
     return parser, dict(subparsers.choices)
 
 

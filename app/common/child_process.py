@@ -58,6 +58,11 @@ def python_module(name: str, *arguments: str) -> tuple[str, ...]:
     return (sys.executable, "-P", "-m", name, *arguments)
 
 
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+
+
 def exit_reason(returncode: int) -> str:
     """Return how a process ended: "signal 9, SIGKILL" or "exit code 1"; "signal 99" for an unknown signal.
 

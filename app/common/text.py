@@ -6,6 +6,9 @@ once.
 
 from __future__ import annotations
 
+import hashlib
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -66,3 +69,18 @@ def version() -> str:
     from importlib.metadata import version as of
 
     return of("stemmap")
+
+
+@cache
+def code_digest() -> str:
+    """Return the version and the first 16 hex digits of a SHA-256 of the sources (.py and .json) of the
+    pipeline, as "version+digest". It is computed once per process."""
+    import pipeline
+
+    assert pipeline.__file__ is not None  # noqa: S101 - the package has an __init__.py
+    folder = Path(pipeline.__file__).parent
+    state = hashlib.sha256()
+    for file in sorted(folder.rglob("*")):
+        if file.suffix in (".py", ".json"):
+            state.update(f"{file.relative_to(folder).as_posix()}\0".encode() + file.read_bytes() + b"\0")
+    return f"{version()}+{state.hexdigest()[:16]}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import sys
 from collections import Counter
 from pathlib import Path
@@ -75,6 +74,7 @@ def refuse_without_grid(arguments: argparse.Namespace) -> None:
     """
     given = {
         "--jobs": arguments.jobs,
+        "a pool of processes": arguments.pool,
         "--out": arguments.out,
         "--keep": arguments.keep,
         "--preset, --config and --set": flags.says_parameters(arguments),
@@ -154,17 +154,17 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
 
 
 def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
-    """Compute all jobs of a plan with a progress bar, in --jobs processes (default: one per usable core, at
-    most one per job). Return their results in the order of `plan.jobs`; print the number of stored results
-    that were used and warnings to standard error."""
+    """Compute all jobs of a plan with a progress bar, in the pool of the command, else in --jobs processes
+    (default: one per usable core, at most one per job). Return their results in the order of `plan.jobs`;
+    print the number of stored results that were used and warnings to standard error."""
+    from app.common.child_process import usable_cores
     from app.common.text import count
     from app.extensions.search.jobs import ResultStore, ScoringProcesses
     from app.extensions.search.report import sweep
 
     kept = ResultStore(kept_results(arguments))
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     processes: ScoringProcesses[int] = ScoringProcesses(
-        min(arguments.jobs or cores, len(plan.jobs)), kept=kept
+        min(arguments.jobs or usable_cores(), len(plan.jobs)), kept=kept, pool=arguments.pool
     )
     with (
         contextlib.closing(processes),

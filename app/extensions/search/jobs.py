@@ -14,13 +14,11 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from functools import cache
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import msgspec
 
-import pipeline
 from app.batch.summary import far_truth
 from app.common.child_process import (
     BlockingChildProcess,
@@ -29,7 +27,8 @@ from app.common.child_process import (
     exit_reason,
     python_module,
 )
-from app.common.text import count, version
+from app.common.task_pool import TaskPool
+from app.common.text import code_digest, count
 from app.sources.live_address import is_live
 from app.sources.request import SourceRequest
 from app.store.records import Content, contents_of
@@ -120,19 +119,6 @@ class JobResult(msgspec.Struct, frozen=True):
         if self.scores is not None and self.scores.TA.of + self.scores.TR.of == 0:
             return far_truth(self.scores.reach)
         return self.error
-
-
-@cache
-def code_digest() -> str:
-    """Return the version and the first 16 hex digits of a SHA-256 of the sources (.py and .json) of the
-    pipeline, as "version+digest". It is computed once per process."""
-    assert pipeline.__file__ is not None  # noqa: S101 - the package has an __init__.py
-    folder = Path(pipeline.__file__).parent
-    state = hashlib.sha256()
-    for file in sorted(folder.rglob("*")):
-        if file.suffix in (".py", ".json"):
-            state.update(f"{file.relative_to(folder).as_posix()}\0".encode() + file.read_bytes() + b"\0")
-    return f"{version()}+{state.hexdigest()[:16]}"
 
 
 COMMAND = python_module("app.extensions.search.scoring")
@@ -248,9 +234,10 @@ class ScoringProcesses(Generic[T]):
     first job; one that is lost is replaced and computes the job again.
 
     Args:
-        count: Number of processes, at least 1.
+        count: Number of processes, at least 1; with a pool, that of the pool is used.
         command: Program and arguments of a process; empty for `app.extensions.search.scoring`.
         kept: Results that are known, to which each new one is added; None for those of this object.
+        pool: Where the jobs are computed; None for processes on this machine.
 
     Attributes:
         count: Number of processes.
@@ -258,12 +245,18 @@ class ScoringProcesses(Generic[T]):
         lost: Counter from the reason to the number of processes that were lost during a job.
     """
 
-    def __init__(self, count: int, command: Sequence[str] = (), kept: ResultStore | None = None) -> None:
-        self.count, self.kept = count, kept or ResultStore()
+    def __init__(
+        self,
+        count: int,
+        command: Sequence[str] = (),
+        kept: ResultStore | None = None,
+        pool: TaskPool | None = None,
+    ) -> None:
+        self.count, self.kept, self._pool = count if pool is None else pool.count, kept or ResultStore(), pool
         self.lost = Counter[str]()
         self._command = command or COMMAND
         self._children: dict[int, BlockingChildProcess] = {}
-        self._threads = ThreadPoolExecutor(count, "scoring")
+        self._threads = ThreadPoolExecutor(self.count, "scoring")
         self._doing: dict[Future[JobResult], tuple[int, T]] = {}
         self._lock = threading.Lock()
         self._is_closed = False
@@ -302,7 +295,7 @@ class ScoringProcesses(Generic[T]):
             f"{count(times, 'process', 'processes')} lost during a job and replaced: {reason}"
             for reason, times in sorted(self.lost.items())
         ]
-        return [*self.kept.warnings(), *lost]
+        return [*self.kept.warnings(), *lost, *([] if self._pool is None else self._pool.warnings())]
 
     def close(self) -> None:
         """End all processes at once and wait for their threads; jobs in progress fail with LostError."""
@@ -310,6 +303,8 @@ class ScoringProcesses(Generic[T]):
             self._is_closed = True
             for child in self._children.values():
                 child.end()
+        if self._pool is not None:
+            self._pool.close(close_runs)
         self._threads.shutdown()
 
     def _known_or_computed(self, worker: int, job: Job) -> JobResult:
@@ -324,6 +319,13 @@ class ScoringProcesses(Generic[T]):
     def _compute(self, worker: int, job: Job) -> JobResult:
         """Return the result of a job that a process computes; a process that ends is replaced. Raises
         LostError after MOST_LOSSES lost processes or `close`, and StemmapError if none can be started."""
+        if self._pool is not None:
+            try:
+                return msgspec.json.decode(
+                    self._pool.call(score_job, msgspec.json.encode(job), worker), type=JobResult
+                )
+            except StemmapError as error:
+                raise LostError(error.what) from error
         reason = ""
         for _ in range(MOST_LOSSES):
             child = self._child(worker)
@@ -350,6 +352,27 @@ class ScoringProcesses(Generic[T]):
             if child is None or child.returncode is not None:
                 child = self._children[worker] = BlockingChildProcess(self._command, one_thread=True)
             return child
+
+
+_scorers: list[Any] = []  # in a process of a pool: those that compute no job now
+
+
+def score_job(job: bytes) -> bytes:
+    """Return the result of a job in JSON, see `app.extensions.search.scoring.Scorer.score`. The run stays
+    open in this process until another one is opened or `close_runs` is called."""
+    from app.extensions.search.scoring import Scorer
+
+    scorer = _scorers.pop() if _scorers else Scorer()
+    try:
+        return msgspec.json.encode(scorer.score(msgspec.json.decode(job, type=Job)))
+    finally:
+        _scorers.append(scorer)
+
+
+def close_runs() -> None:
+    """Close the runs that `score_job` left open in this process."""
+    while _scorers:
+        _scorers.pop().close()
 
 
 def _result(future: Future[JobResult]) -> JobResult:

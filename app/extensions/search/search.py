@@ -18,6 +18,7 @@ import numpy as np
 
 from app.batch.summary import far_map, far_truth
 from app.common.child_process import ParentConnection, run_child
+from app.common.task_pool import TaskPool
 from app.extensions.search.jobs import COMMAND, Job, JobResult, ResultStore, ScoringProcesses
 from app.extensions.search.plan import (
     Plan,
@@ -289,16 +290,17 @@ class Search:
         return {name: float(value) for name, value in found.items() if np.isfinite(value)}
 
 
-def search_processes(plan: Plan, number: int = 1) -> ScoringProcesses[_Tag]:
+def search_processes(plan: Plan, number: int = 1, pool: TaskPool | None = None) -> ScoringProcesses[_Tag]:
     """Return processes that score the sets of a search; each keeps all runs open. Results are stored in the
     folder `plan.kept`, without one in memory. The caller closes the processes.
 
     Args:
         plan: The search.
         number: Number of processes.
+        pool: Where they are; None for this machine.
     """
     kept = ResultStore(Path(plan.kept) if plan.kept else None)
-    return ScoringProcesses(number, (*COMMAND, "--runs", str(len(plan.runs))), kept)
+    return ScoringProcesses(number, (*COMMAND, "--runs", str(len(plan.runs))), kept, pool)
 
 
 _MESSAGE_INTERVAL_S = 0.25

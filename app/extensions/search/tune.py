@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     plan = _plan(arguments)
     compile_ahead()
-    with closing(search_processes(plan, arguments.workers)) as workers:
+    with closing(search_processes(plan, arguments.workers, arguments.pool)) as workers:
         search = Search(plan, workers)
         stopped = _search(search)
         flags.print_warnings(workers.warnings())

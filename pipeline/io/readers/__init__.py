@@ -355,14 +355,19 @@ def named(names: list[str]) -> str:
 
 def folder_opener(folder: Path) -> Opener | None:
     """Return the opener of a folder by the names of the files in it, and of `velodyne/*.bin`; None if nothing
-    in it can be read. Where several formats fit, the order is TreeManager, ROS recording, scans. OSError if
-    the folder cannot be read."""
+    in it can be read, or it has several ROS recordings without metadata.yaml, which are runs of their own.
+    Where several formats fit, the order is TreeManager, ROS recording, scans. OSError if the folder cannot be
+    read."""
     names = {path.name for path in folder.iterdir() if path.is_file()}
     if any(name.startswith("TreeManagerState_") for name in names):
         return _tree_manager
-    suffixes = {Path(name).suffix.lower() for name in names}
-    if suffixes & {".mcap", ".db3", ".zstd"}:
+    suffixes = [Path(name).suffix.lower() for name in names]
+    bags = suffixes.count(".mcap") + suffixes.count(".db3")
+    if bags > 1 and "metadata.yaml" not in names:
+        return None
+    if bags or ".zstd" in suffixes:
         return _recording
     inside = folder / "velodyne"
     is_kitti = inside.is_dir() and any(inside.glob("*.bin"))
-    return _scans if is_kitti or suffixes & {".bin", ".pcd", ".ply", ".npy", ".npz", ".las", ".laz"} else None
+    kinds = {".bin", ".pcd", ".ply", ".npy", ".npz", ".las", ".laz"}
+    return _scans if is_kitti or kinds.intersection(suffixes) else None

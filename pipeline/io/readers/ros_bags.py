@@ -144,7 +144,7 @@ def bag_files(folder: Path) -> list[Path]:
     one of its name.
 
     Raises:
-        SourceError: A file is only there compressed, or there are several without metadata.yaml.
+        SourceError: A file is only there compressed.
         OSError: The folder cannot be read.
     """
     inside = sorted(folder.iterdir(), key=_natural)
@@ -157,12 +157,6 @@ def bag_files(folder: Path) -> list[Path]:
             "files of the recording are compressed",
             where=str(packed[0]),
             remedy="Unpack them with zstd -d.",
-        )
-    if len(files) > 1 and not (folder / "metadata.yaml").is_file():
-        raise SourceError(
-            f"the folder holds {len(files)} recordings without metadata.yaml",
-            where=str(folder),
-            remedy="Name one of the files.",
         )
     return files
 

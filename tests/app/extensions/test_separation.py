@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parents[3]
 #: Words by which only the files of an extension name what it does.
 WORDS = {
     "clouds": r"(?<!stand )inventory|of_cloud|map_plot|PlotMap|stem curve|CloudSource|extensions.clouds",
+    "cluster": r"\bdask|many_runs|map_runs",
     "dds": r"\bdds:|DdsLink|cyclone|plain DDS|fast_?dds",
     "fleet": r"fleet|robots-link|common.map",
     "formats": r"victoria",
@@ -66,6 +67,7 @@ def test_only_its_own_files_name_an_extension(name):
 @pytest.mark.parametrize(
     ("words", "name"),
     [
+        ("map sim:stand --out out --jobs 2", "cluster"),
         ("tune sim:stand", "search"),
         ("train", "learning"),
         ("report DIR", "stand"),

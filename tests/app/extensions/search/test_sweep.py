@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from app.common.text import code_digest
 from app.extensions.search.jobs import (
     MOST_LOSSES,
     Job,
@@ -21,7 +22,6 @@ from app.extensions.search.jobs import (
     LostError,
     ResultStore,
     ScoringProcesses,
-    code_digest,
 )
 from app.extensions.search.report import sweep
 from tests.app.extensions.search.inline_worker import InlineProcesses
