@@ -46,9 +46,9 @@ from pipeline.slam.particle_ancestry import (
     normalised,
     select_best,
 )
-from pipeline.slam.particle_maps import known_near, shared_map, take_ancestors
+from pipeline.slam.particle_maps import MapColumns, known_near, shared_map, take_ancestors
 from pipeline.slam.particle_update import Rules, against_slip, estimated, use_scan
-from pipeline.slam.places import ODDS, PlaceStates, agreement
+from pipeline.slam.places import NO_PLACES, ODDS, PlaceStates, agreement
 from pipeline.slam.pose_quality import (
     FEWEST,
     OdometryDoubt,
@@ -79,6 +79,7 @@ class FastSlam:
         self.parameters = parameters
         self.seed = seed
         self.state = SlamState.at_origin(parameters.particles)
+        self._known = (self.state.maps, 0, 0, self.state.map_of(0))
 
     def process(
         self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
@@ -107,7 +108,6 @@ class FastSlam:
             scan each detection has one.
         """
         p = self.parameters
-        noise, offset = draws(self.seed, index, p.particles)
         motion = Motion(motion) if isinstance(motion, Pose2) else motion
         state = self._moved(self.state.with_particles(p.particles), motion)
         ancestors, doubt = None, motion.doubt
@@ -126,7 +126,9 @@ class FastSlam:
         doubt = doubt or slip_detection.slip_message(
             state.motion, slipped, trees.unsure, registered=motion.covariance is not None
         )
+        offset = 0.0
         if used:
+            noise, offset = draws(self.seed, index, p.particles)
             state, scan, weights, births = self._observed(
                 state,
                 trees,
@@ -142,7 +144,7 @@ class FastSlam:
         else:
             scan, weights, births = ScanStatistics(), normalised(state.log_weight), None
         reach = _farthest(detections) if used else 0.0
-        estimate, frame, by_trees = _estimate(state, weights, p, reach)
+        estimate, frame, by_trees = _estimate(state, self._best_map(state), weights, p, reach)
         if births is not None:
             state = self._with_places(state, births[state.best], detections.centre, R, estimate, reach)
         if used:
@@ -382,7 +384,7 @@ class FastSlam:
         """Return the pose of the present state, for example after `place`, with the health and the
         associations of an earlier estimate. The state is unchanged."""
         weights = normalised(self.state.log_weight)
-        estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
+        estimate, _, _ = _estimate(self.state, self._best_map(self.state), weights, self.parameters, 0.0)
         return replace(estimate, health=before.health, landmark_of=before.landmark_of)
 
     def health_without_detections(self, estimate: PoseEstimate) -> Health:
@@ -412,9 +414,17 @@ class FastSlam:
     def landmarks(self) -> Landmarks:
         """Return all landmarks of the best particle, those with few hits and in inactive places as well, with
         the gate and the maximum distance of the parameters. Their scores are those of `hits_less_misses`."""
-        known, p = self.state.map_of(self.state.best), self.parameters
+        known, p = self._best_map(self.state), self.parameters
         score = hits_less_misses(known.hits, known.score, p.misses_per_hit)
         return Landmarks(known.birth, known.mean, known.covariance, score, p.gate, p.distance_max)
+
+    def _best_map(self, state: SlamState) -> MapColumns:
+        """Return the landmarks of the best particle, which only a used scan changes in place."""
+        maps, views, best, known = self._known
+        if state.maps is not maps or state.views != views or state.best != best:
+            known = state.map_of(state.best)
+            self._known = (state.maps, state.views, state.best, known)
+        return known
 
     def map_error(self, landmarks: Landmarks) -> Float:
         """Return the covariance of the error of the map at each landmark, which all particles share, shape
@@ -440,7 +450,7 @@ class FastSlam:
         `hits_to_weigh` hits: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]. The
         scan of a landmark is that of its reference pose, which may be a little earlier than the scan that
         began it."""
-        known = self.state.map_of(self.state.best)
+        known = self._best_map(self.state)
         young = self.state.frame.scan_of(known.birth) >= scan
         rows = young & (known.hits >= self.parameters.hits_to_weigh)
         return known.mean[rows], known.covariance[rows]
@@ -535,6 +545,9 @@ class FastSlam:
         """Return the states of the places whose landmarks any particle may associate with detections after
         the motion of the state; an empty table if all of them are active. `centre` contains the detections in
         the base frame, shape (D, 2) [m]."""
+        places = state.places
+        if not (places.inactive.any() or places.is_old(state.distance).any()):
+            return NO_PLACES
         x, y, _ = state.pose[state.best].tolist()
         apart = np.hypot(state.pose[:, 0] - x, state.pose[:, 1] - y).max()
         reach = self.parameters.view_range + self.parameters.distance_max + float(apart)
@@ -660,7 +673,8 @@ class FastSlam:
             return shared
         if not shared.begun:
             moved = replace(state, motion=motion, motion_covariance=covariance)
-            now, _, _ = _estimate(moved, normalised(state.log_weight), self.parameters, 0.0)
+            weights = normalised(state.log_weight)
+            now, _, _ = _estimate(moved, self._best_map(moved), weights, self.parameters, 0.0)
             shared = SharedErrors.begun_at(len(state.pose), now.T_map_base.as_array(), now.covariance)
         return shared.measured(measured)
 
@@ -702,7 +716,7 @@ def rules_of(p: Slam) -> Rules:
 
 
 def _estimate(
-    state: SlamState, weights: Float, p: Slam, reach: float
+    state: SlamState, landmarks: MapColumns, weights: Float, p: Slam, reach: float
 ) -> tuple[PoseEstimate, FrameUncertainty, bool]:
     """Return the pose, the uncertainty of the frame after it, and whether known landmarks within `reach`
     determine it (always False before a measured pose with shared errors was used). The state is unchanged.
@@ -713,12 +727,12 @@ def _estimate(
 
     Args:
         state: State with the motion since the last used scan.
+        landmarks: Landmarks of its best particle.
         weights: Weights with sum 1, shape (P,).
         p: Parameters.
         reach: Maximum distance of landmarks that determine the pose [m]; 0 for a scan without detections.
     """
     pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
-    landmarks = state.map_of(state.best)
     known = landmarks
     if state.places.inactive.any():
         known = landmarks.take(state.places.is_usable(landmarks.birth))
@@ -735,7 +749,9 @@ def _estimate(
             by_landmarks = at_least(spread, shared.by_trees, NOISE / np.sqrt(n_eff))
         covariance, frame = frame.with_measured_pose(spread, n_eff, shared.joint[:3, :3], by_landmarks)
     reported = mean
-    if are_apart(pose, weights, p.distance_max):
+    # The scatter of the particles is a part of `spread`.
+    limit = 2.0 * p.distance_max * p.distance_max
+    if spread[0, 0] + spread[1, 1] > limit and are_apart(pose, weights, p.distance_max):
         # The mean of separate hypotheses agrees with no map, so the best particle is reported. The second
         # moment about it is larger than the covariance by the square of its distance from the mean (Steiner).
         reported = pose[state.best]

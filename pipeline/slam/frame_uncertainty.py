@@ -92,17 +92,19 @@ class FrameUncertainty:
         if not len(used):
             hidden = transported_covariance(self.hidden, pose[0] - self.at[0], pose[1] - self.at[1])
             return spread + hidden, replace(self, hidden=hidden, at=pose)
-        least, of_map = np.zeros((3, 3)), np.zeros((3, 3))
-        for m, weight in zip(used.tolist(), (counts / counts.sum()).tolist(), strict=True):
-            dx, dy = (pose[:2] - self.pose[m, :2]).tolist()
-            part = weight * transported_covariance(self.covariance[m], dx, dy)
-            if self.smoothed[m]:
-                least += weight * spread
-                of_map += part
-            else:
-                least += part
+        weight, smoothed = (counts / counts.sum())[:, None, None], self.smoothed[used][:, None, None]
+        part = weight * self._transported(used, pose)
+        least = np.where(smoothed, weight * spread, part).sum(axis=0)
+        of_map = np.where(smoothed, part, 0.0).sum(axis=0)
         covariance = at_least(spread, least, NOISE / math.sqrt(n_eff)) + of_map
         return covariance, replace(self, hidden=covariance - spread, at=pose)
+
+    def _transported(self, rows: Int, pose: Float) -> Float:
+        """Return the covariances of reference poses, transported to a pose, shape (U, 3, 3)."""
+        A = np.tile(np.eye(3), (len(rows), 1, 1))
+        A[:, 0, 2], A[:, 1, 2] = self.pose[rows, 1] - pose[1], pose[0] - self.pose[rows, 0]
+        moved: Float = A @ self.covariance[rows] @ A.transpose(0, 2, 1)
+        return moved
 
     def _references(
         self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float

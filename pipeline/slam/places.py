@@ -129,7 +129,7 @@ class Places:
         state = np.where(self.inactive, INACTIVE, np.where(self.is_old(distance), UNCERTAIN, ACTIVE))
         row = self._row(birth)
         if not np.any(state[row[row >= 0]] != ACTIVE):
-            return PlaceStates(self.birth[:0], state[:0])
+            return NO_PLACES
         return PlaceStates(self.birth, state)
 
     def _row(self, birth: Int) -> Int:
@@ -160,6 +160,10 @@ class PlaceStates(NamedTuple):
 
     birth: Int
     state: Int
+
+
+#: The table where all places are active.
+NO_PLACES = PlaceStates(np.zeros(0, np.int64), np.zeros(0, np.int64))
 
 
 @compiled_borrowing

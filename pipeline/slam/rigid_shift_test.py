@@ -76,11 +76,7 @@ def estimate_rigid_shift(
         trees, shape (3,); and the covariance of this pose, shape (3, 3). If both bools are False, pose and
         covariance have no meaning.
     """
-    # Pairs at the odometry, then pairs at the pose that these determine (iterative closest point; Besl, McKay
-    # 1992), since a turn moves distant trees beyond NEAR.
-    fit = _fitted(pose, centre, R, known, spread, well, trust)
-    if fit.agree > 0:
-        fit = _fitted(fit.place, centre, R, known, spread, well, trust)
+    fit = _fitted_twice(pose, centre, R, known, spread, well, trust)
     place, agree, nothing = fit.place, fit.agree, (False, False, fit.place, fit.covariance)
     if agree == 0:
         return nothing
@@ -126,6 +122,16 @@ class Fit(NamedTuple):
     owner: Int
     square: Float
     kept: Bool
+
+
+@compiled
+def _fitted_twice(
+    pose: Float, centre: Float, R: Float, known: Float, spread: Float, well: Bool, trust: OdometryTrust
+) -> Fit:
+    """Return `_fitted` at a pose and, if enough pairs agree, at the pose that these determine (iterative
+    closest point; Besl, McKay 1992), since a turn moves distant trees beyond NEAR."""
+    fit = _fitted(pose, centre, R, known, spread, well, trust)
+    return _fitted(fit.place, centre, R, known, spread, well, trust) if fit.agree > 0 else fit
 
 
 @compiled

@@ -68,8 +68,8 @@ def slip_message(motion: Float, corrected: bool, unsure: bool, registered: bool 
     """
     if corrected and registered:
         return MISREGISTERED
-    stood = np.hypot(motion[0], motion[1]) < STOOD[0] and abs(motion[2]) < STOOD[1]
     if corrected:
+        stood = np.hypot(motion[0], motion[1]) < STOOD[0] and abs(motion[2]) < STOOD[1]
         return STUCK if stood else SLIPPED
     return UNSURE if unsure else ""
 
@@ -124,16 +124,17 @@ def motion_by_trees(
     well = known[well_known]
     sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
     hits, expected, by_chance = count_matches(pose, centre, sigma, well, position, heading, gate)
-    reduced = np.diag(np.array([position, position, heading]) + SIGMA**2)
+    variances = np.array([position, position, heading])
     if expected < FEWEST or hits >= EXPLAINED * expected:
         wide = covariance[0, 0] + covariance[1, 1] > 2.0 * WIDE * WIDE
         if wide and expected >= FEWEST and hits >= CONVINCING * expected:
-            return TreeMotion(False, motion.copy(), reduced, unsure)  # the doubt is refuted
+            # the doubt is refuted
+            return TreeMotion(False, motion.copy(), np.diag(variances + SIGMA**2), unsure)
         return TreeMotion(False, motion.copy(), covariance.copy(), unsure)
     agree, sure, place = search_offset(pose, centre, sigma, well)
     if not sure or hits > by_chance + agree // STANDING:
         return TreeMotion(False, motion.copy(), covariance.copy(), unsure)
-    return TreeMotion(True, _from(before, place), reduced, False)
+    return TreeMotion(True, _from(before, place), np.diag(variances + SIGMA**2), False)
 
 
 def _from(before: Float, place: Float) -> Float:

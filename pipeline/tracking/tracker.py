@@ -248,11 +248,13 @@ class Tracker:
         """
         t, scan = self.tracks, self._scan
         y = position - t.x[rows, :2]
+        # Few are beyond the gate by their own covariance alone, which is a part of the whole one.
+        far = _are_beyond(y, own, landmarks.gate)
+        if not far.any():
+            return
+        rows, y, own = rows[far], y[far], own[far]
         S = t.P[rows, :2, :2] - t.shared[rows] + spread_by_pose(t.x[rows, :2], scan.pose, scan.relative) + own
-        # d^2 > gate^2, for d^2 = y^T S^-1 y written with the adjugate of S
-        squared = S[:, 1, 1] * y[:, 0] ** 2 - 2.0 * S[:, 0, 1] * y[:, 0] * y[:, 1] + S[:, 0, 0] * y[:, 1] ** 2
-        determinant = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
-        rows = rows[squared > landmarks.gate**2 * determinant]
+        rows = rows[_are_beyond(y, S, landmarks.gate)]
         if not len(rows):
             return
         order = np.argsort(landmarks.birth)
@@ -281,6 +283,14 @@ class Tracker:
         new.landmark[:] = landmark
         self.tracks = self.tracks.extended(new)
         self.next_number += len(new)
+
+
+def _are_beyond(y: Float, S: Float, gate: float) -> Bool:
+    """Return which innovations, shape (K, 2) [m], with covariances of shape (K, 2, 2) are beyond a gate
+    [sigma], shape (K,): d^2 > gate^2, for d^2 = y^T S^-1 y written with the adjugate of S."""
+    y0, y1, xx, xy, yy = y[:, 0], y[:, 1], S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
+    beyond: Bool = yy * y0**2 - 2.0 * xy * y0 * y1 + xx * y1**2 > gate**2 * (xx * yy - xy**2)
+    return beyond
 
 
 # ns; in this time a robot that drives 1 m/s drifts by 0.25 m if its odometry errs by 2.5 %, less than the
