@@ -20,6 +20,7 @@ from pipeline.detection.free_space import BINS
 from pipeline.front_end import DetectionResult, SegmentedScan, StageTimer, detect, no_timer, segment
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float, Pose2, Pose3
+from pipeline.ground.scan_ground import NO_GROUND
 from pipeline.ground.terrain_map import HeightMapper, HeightMapState
 from pipeline.loop_closure import detection
 from pipeline.loop_closure.correction import (
@@ -31,6 +32,7 @@ from pipeline.loop_closure.correction import (
     Smoothing,
 )
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
+from pipeline.map_faults import MapFaults, reasons_of
 from pipeline.odometry.gyro import UNUSED, fused
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.slam.measured_pose import REJECTED, within_gate
@@ -71,6 +73,7 @@ class MapperState:
         recovery: Search for a lost robot.
         last: Pose after the last scan, with its covariance.
         delayed: Correction of the path that columns and terrain do not have yet.
+        faults: Faults during the run.
     """
 
     slam: SlamState
@@ -85,6 +88,7 @@ class MapperState:
     recovery: RelocaliserState[MapperState] = field(default_factory=RelocaliserState)
     last: tuple[Pose2, Float] | None = None
     delayed: PathCorrection | None = None
+    faults: MapFaults = field(default_factory=MapFaults)
 
 
 Correction = Restart[MapperState] | RelocalisedPose | LoopClosure | DoubledTrees | Smoothing | SearchFailure
@@ -136,6 +140,7 @@ class Mapper:
         self._placed = self._closed = 0
         self._last: tuple[Pose2, Float] | None = None
         self._delayed: PathCorrection | None = None
+        self._faults = MapFaults()
 
     def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
         """Map one scan: update path, trees, voxel columns and terrain, correct the map where a loop is closed
@@ -175,6 +180,8 @@ class Mapper:
         estimate, closure = self._apply(step.index, closure, estimate)
 
         self._last = (estimate.T_map_base, estimate.covariance)
+        estimate, doubts = self._check_faults(step, scan, estimate)
+        notices = (*notices, *doubts)
         return self._frame(step, scan, found, estimate, notices, correction, closure)
 
     def segment(self, step: Step) -> SegmentedScan:
@@ -242,6 +249,7 @@ class Mapper:
             self._relocaliser.state.copy(),
             self._last,
             self._delayed,
+            self._faults,
         )
 
     def restore(self, state: MapperState) -> None:
@@ -252,6 +260,7 @@ class Mapper:
         self._odometry = state.odometry
         self._path.return_to(state.path_length)
         self._placed, self._closed, self._last = state.placed, state.closed, state.last
+        self._faults = state.faults
         self._relocaliser.state = state.recovery.copy()
 
     def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float, motion: Float) -> None:
@@ -433,6 +442,22 @@ class Mapper:
             run = self._history(estimate)
             return relocaliser.search(index, motion, found.detections, scan.free, p, run)
         return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_lost else None
+
+    def _check_faults(
+        self, step: Step, scan: SegmentedScan, estimate: PoseEstimate
+    ) -> tuple[PoseEstimate, tuple[str, ...]]:
+        """Update the faults of the run. Return the estimate, whose pose quality is not good while a fault
+        lasts, and the messages about new faults."""
+        is_empty = (
+            self._parameters.ground.method != "none" and len(step.scan.points) > 0 and not len(scan.raw)
+        )
+        no_ground = NO_GROUND in scan.warnings
+        reasons = reasons_of(estimate.health, is_ground_missing=no_ground, is_empty=is_empty)
+        self._faults, messages = self._faults.after_scan(step.scan.stamp_ns, reasons)
+        if estimate.health.state == "good" and self._faults.message:
+            health = replace(estimate.health, state="weak", reason=self._faults.message)
+            return replace(estimate, health=health), messages
+        return estimate, messages
 
     def _check_loop(self, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
         """Return the loop that the robot has just closed, by a constellation or by doubled trees, or

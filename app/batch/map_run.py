@@ -23,6 +23,7 @@ from app.batch.summary import (
     breaks_of,
     driven,
     far_truth,
+    left_out_warning,
     start_lines,
     summary_lines,
     unconfirmed_warning,
@@ -41,12 +42,17 @@ from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers.base import Source
 from pipeline.io.result_files import ODOMETRY, RunFiles, seen_text, terrain_text, tum_text
 from pipeline.jit import on_compiling
+from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
+from pipeline.map_faults import DOUBTFUL
 from pipeline.mapper import Mapper
+from pipeline.odometry.lidar_odometry import LOST
 from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.seen_area import SeenArea, SeenRecorder, ViewSelection
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
 MEASURED_SCANS = 100_000  # whose times enter the medians
+#: First words of the warnings after which a map is not to be trusted.
+WRONG = (DOUBTFUL, DOUBLED, LOST, NOT_FOUND)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,6 +172,8 @@ def _map(
         tally.warned[far_truth(evaluation.reach)] += 1
     if unconfirmed := unconfirmed_warning(frame, plan.parameters):
         tally.warned[unconfirmed] += 1
+    if left_out_words := left_out_warning(losses, frame.index + 1):
+        tally.warned[left_out_words] += 1
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words

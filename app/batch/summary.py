@@ -13,6 +13,7 @@ import numpy as np
 from app.common.text import count
 from pipeline.config import Parameters
 from pipeline.evaluation import MapScores, PathError, Rate
+from pipeline.map_faults import DOUBTFUL
 from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
 
 if TYPE_CHECKING:
@@ -224,6 +225,18 @@ def warning_texts(warned: Mapping[str, int]) -> list[str]:
     return [text if n == 1 else f"{text} ({n:,} times)" for text, n in warned.items()]
 
 
+def exit_code(warnings: Iterable[str], losses: Mapping[str, int], wrong: tuple[str, ...]) -> int:
+    """Return the exit code of a mapping command: 3 with losses or with a warning that begins with one of
+    `wrong`; else 0.
+
+    Args:
+        warnings: Messages to the user.
+        losses: Dict from reasons to numbers of records that were left out.
+        wrong: First words of warnings after which the map is not to be trusted.
+    """
+    return 3 if losses or any(text.startswith(wrong) for text in warnings) else 0
+
+
 def unconfirmed_warning(frame: Frame, parameters: Parameters) -> str:
     """Return a warning with the number of trees that are not confirmed; "" if there are none, or if a
     classifier confirms trees by more than their number of scans.
@@ -239,6 +252,26 @@ def unconfirmed_warning(frame: Frame, parameters: Parameters) -> str:
     return (
         f"{them} seen fewer than {parameters.tracking.hits_to_confirm} times and left out of the map; "
         "--set tracking.hits_to_confirm=1 includes them"
+    )
+
+
+LEFT_OUT = 0.1  # share of the scans above which their loss makes the map doubtful
+
+
+def left_out_warning(losses: Mapping[str, int], scans: int) -> str:
+    """Return a warning if more than LEFT_OUT of the scans of a run were left out; else "".
+
+    Args:
+        losses: Dict from reasons to numbers of records that were left out; those of scans begin with "scans".
+        scans: Number of mapped scans.
+    """
+    left_out = {reason: n for reason, n in losses.items() if reason.startswith("scans")}
+    lost = sum(left_out.values())
+    if lost <= LEFT_OUT * (lost + scans):
+        return ""
+    return (
+        f"{DOUBTFUL} in the whole run: {lost:,} of {lost + scans:,} scans were left out, most often: "
+        f"{max(left_out, key=left_out.__getitem__)}; trees may be missing"
     )
 
 

@@ -53,7 +53,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Writes trees.csv, path.csv, trees.geojson, detections.csv, terrain.csv, run.json and state.zip\n"
         "(the state of the map) to DIR, with the same bytes for the same source, parameters and seed. A map\n"
-        "of the same source in DIR is replaced. Exit code 3: some messages or points were left out."
+        "of the same source in DIR is replaced. Exit code 3: some messages or points were left out,\n"
+        "or the map is doubtful; a line then says since when, why, and what it means for the map."
     )
 
 
@@ -62,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Map a run of scans; print the result.
 
     Returns:
-        Exit code: 3 if messages or points were left out, else 0.
+        Exit code: 3 if messages or points were left out or the map is doubtful, else 0.
 
     Raises:
         StemmapError: The arguments contradict each other, or the run cannot be mapped.
@@ -88,14 +89,12 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
     """
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
-    from app.batch.map_run import OfflineRun, map_run
+    from app.batch.map_run import WRONG, OfflineRun, map_run
     from app.batch.run_folder import check_folder, partial_output_warnings
     from app.robot.source import LiveSource, open_any
     from app.worker.numba_warmup import compile_ahead
     from app.worker.run import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
-    from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
-    from pipeline.odometry.lidar_odometry import LOST
 
     flags.print_warnings(partial_output_warnings(arguments.out))
     flags.refuse_one_step(arguments)
@@ -156,7 +155,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
         outcome.warnings,
         outcome.losses,
         replaces=replaces,
-        wrong=(DOUBLED, LOST, NOT_FOUND),
+        wrong=WRONG,
     )
 
 
@@ -169,8 +168,7 @@ def print_result(
     replaces: bool,
     wrong: tuple[str, ...] = (),
 ) -> int:
-    """Print the result of a mapping command; return the exit code: 3 with losses or with a warning
-    that begins with one of `wrong`; else 0.
+    """Print the result of a mapping command; return the exit code, see `summary.exit_code`.
 
     Args:
         summary: Lines to print.
@@ -180,13 +178,15 @@ def print_result(
         replaces: Whether the folder had the files of an earlier run.
         wrong: First words of warnings after which the map is not as it should be.
     """
+    from app.batch.summary import exit_code
+
     for line in summary:
         print(line)
     print(f"files in {out}" + (" (replaced)" if replaces else ""))
     flags.print_warnings(warnings)
     for reason, number in losses.items():
         print(f"left out: {reason} ({number:,})", file=sys.stderr)
-    return 3 if losses or any(text.startswith(wrong) for text in warnings) else 0
+    return exit_code(warnings, losses, wrong)
 
 
 # --- live sources ------------------------------------------------------------------------------------

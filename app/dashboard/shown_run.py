@@ -15,7 +15,7 @@ import numpy as np
 from app.batch.map_frame import write_map_frame
 from app.batch.run_edits import reviews_of
 from app.batch.run_folder import as_written, recorded_time, score_map
-from app.batch.summary import far_truth, unconfirmed_warning
+from app.batch.summary import far_truth, left_out_warning, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
 from app.sources.one_step import OneStep
@@ -224,6 +224,8 @@ class ShownRun:
                 warnings.append(far_truth(scores["reach"]))
             if unconfirmed := unconfirmed_warning(self.shown.frame, self.parameters):
                 warnings.append(unconfirmed)
+            if left_out := left_out_warning(counts.losses, self.shown.frame.index + 1):
+                warnings.append(left_out)
         worst = {} if counts.sigma_xy_m is None else {"sigma_xy_m": counts.sigma_xy_m}
         return {
             **({"health": {"scans": counts.health, "worst": worst}} if counts.health else {}),

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.geometry.poses import Float
 from pipeline.slam.motion import Noise, OdometryTrust, wrapped
 from pipeline.slam.rigid_shift_test import FAMILIAR, MANY
-from pipeline.types.records import SIGMA_XY_MAX, Health, HealthState
+from pipeline.types.records import ALONE, SIGMA_XY_MAX, Health, HealthState
 
 # Columns of the statistics of a scan by particle; SHIFT is the deviation x, y [m], yaw [rad] from the
 # odometry.
@@ -401,7 +401,7 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
     if recent.mapped and recent.alone > ALONE_WEAK:
         return (
             "weak",
-            f"fewer than two known trees in view for {recent.alone:.0f} m: only odometry is used",
+            f"{ALONE} for {recent.alone:.0f} m: only odometry is used",
         )
     return "good", ""
 

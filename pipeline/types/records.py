@@ -536,6 +536,8 @@ HealthState = Literal["good", "weak", "lost"]
 #: Standard deviation up to which a position is usable [m]: the usual distance between neighbouring trunks,
 #: beyond which associations become wrong.
 SIGMA_XY_MAX = 1.5
+#: First words of the reason of a weak pose that no tree contradicts, because none is in view.
+ALONE = "fewer than two known trees in view"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """`python -m tests.benchmarks NAME`: runs benchmarks, from the root of a clone.
 
-`golden`, `results` and `size` are programs of their own with their own flags.
+`golden`, `honest`, `results` and `size` are programs of their own with their own flags.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.benchmarks.seeds import VARIABLE
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Modules of this package that are called by name like a benchmark, but write no table.
-PROGRAMS = ("golden", "results", "size")
+PROGRAMS = ("golden", "honest", "results", "size")
 
 
 def main(words: list[str] | None = None) -> int:

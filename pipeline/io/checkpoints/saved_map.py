@@ -16,6 +16,7 @@ from pipeline.config import Parameters
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.ground.terrain_map import PackedHeightMap
 from pipeline.loop_closure.kidnapped_robot import RelocaliserState
+from pipeline.map_faults import MapFaults
 from pipeline.mapper import Mapper, MapperState
 from pipeline.slam import SlamState
 from pipeline.slam.frame_uncertainty import FrameUncertainty
@@ -55,6 +56,7 @@ class SavedMap:
     placed: int
     closed: int
     search: SavedSearch | None = None
+    faults: MapFaults = MapFaults()  # noqa: RUF009
 
     @classmethod
     def of(cls, mapper: Mapper) -> SavedMap:
@@ -76,6 +78,7 @@ class SavedMap:
             state.placed,
             state.closed,
             None if lost.local is None else SavedSearch(lost.local, lost.driven, lost.since),
+            state.faults,
         )
 
     def state(self) -> MapperState:
@@ -104,7 +107,7 @@ class SavedMap:
         gathering = ColumnClassifierState(self.memory.checked(), (), self.columns)
         return MapperState(
             self.slam, gathering, self.ground.unpacked(), self.tracks, self.next_number, self.odometry, n,
-            self.placed, self.closed, self._recovery(n),
+            self.placed, self.closed, self._recovery(n), faults=self.faults,
         )  # fmt: skip
 
     def _recovery(self, scans: int) -> RelocaliserState[MapperState]:

@@ -1,0 +1,79 @@
+"""Faults that last make a map doubtful; short ones do not."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.map_faults import DOUBTFUL, EMPTY, MapFaults, reasons_of
+from pipeline.types.records import Health
+
+PERIOD_NS = 100_000_000
+DOUBT = "the trees contradict the odometry"
+
+
+def messages_of(pattern, kind="odometry", period_ns=PERIOD_NS):
+    """Messages of a run; `pattern` has a 1 for each scan with a fault, 0 for others."""
+    faults, messages = MapFaults(), list[str]()
+    for k, failed in enumerate(pattern):
+        faults, new = faults.after_scan(5 + k * period_ns, {kind: DOUBT} if failed else {})
+        messages += new
+    return messages, faults
+
+
+@pytest.mark.parametrize("kind", ["lost", "odometry", "trees", "ground"])
+def test_a_fault_of_five_seconds_is_reported_once_with_its_begin(kind):
+    messages, faults = messages_of([0] * 100 + [1] * 50, kind)
+    assert len(messages) == 1
+    assert messages[0].startswith(f"{DOUBTFUL} since 10.0 s: {DOUBT}; ")
+    assert faults.message == messages[0]
+
+
+def test_slips_of_two_seconds_are_not_reported():
+    messages, faults = messages_of(([0] * 100 + [1] * 20) * 5)
+    assert messages == []
+    assert faults.message == ""
+
+
+def test_a_fault_in_most_of_the_scans_is_reported_once():
+    messages, _ = messages_of([1, 1, 1, 0] * 100)
+    assert len(messages) == 1
+    assert "since 0.8 s" in messages[0]
+
+
+def test_a_fault_that_is_over_and_returns_is_reported_again():
+    messages, faults = messages_of([0] * 10 + [1] * 60 + [0] * 200 + [1] * 60 + [0] * 200)
+    assert [text.split(" s:")[0] for text in messages] == [f"{DOUBTFUL} since 1.0", f"{DOUBTFUL} since 27.0"]
+    assert faults.message == ""
+
+
+def test_a_fault_is_measured_by_time_and_not_by_scans():
+    assert len(messages_of([1] * 45, period_ns=PERIOD_NS)[0]) == 1
+    assert len(messages_of([1] * 450, period_ns=PERIOD_NS // 10)[0]) == 1
+    assert len(messages_of([1] * 100, period_ns=PERIOD_NS // 10)[0]) == 0
+
+
+def test_a_pause_between_two_scans_is_no_fault():
+    faults, _ = MapFaults().after_scan(0, {})
+    faults, messages = faults.after_scan(3600 * 10**9, {"odometry": "no scan for 3600 s"})
+    assert messages == ()
+    assert faults.message == ""
+
+
+def test_the_reasons_are_those_of_the_pose_quality_and_of_the_ground():
+    def reasons(state="good", reason="", doubt="", *, ground=False, empty=False):
+        health = Health(state=state, reason=reason, doubt=doubt)
+        return reasons_of(health, is_ground_missing=ground, is_empty=empty)
+
+    assert reasons() == {}
+    assert reasons(state="lost", reason="no tree is found") == {"lost": "no tree is found"}
+    assert reasons(state="good", doubt=DOUBT) == {"odometry": DOUBT}
+    assert reasons(state="weak", reason=DOUBT, doubt=DOUBT) == {"odometry": DOUBT}
+    assert reasons(state="weak", reason="most detections match two trees") == {
+        "trees": "most detections match two trees"
+    }
+    assert (
+        reasons(state="weak", reason="fewer than two known trees in view for 9 m: only odometry is used")
+        == {}
+    )
+    assert "ground" in reasons(ground=True)
+    assert reasons(empty=True) == {"ground": EMPTY}
