@@ -33,6 +33,7 @@ COMMANDS = (
     "export",
     "params",
     "licences",
+    "doctor",
     "extensions",
 )
 
@@ -50,7 +51,7 @@ def commands() -> dict[str, str]:
 
 CODES = (
     "Exit codes: 0 done; 1 failed, with a message; 2 wrong usage, such as a mistyped flag, parameter or\n"
-    "scenario; 3 done, but something was left out (see stderr)."
+    "scenario; 3 done, but something was left out or the map is doubtful (see stderr)."
 )
 
 

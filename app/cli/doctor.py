@@ -1,0 +1,250 @@
+"""`stemmap doctor`: tests whether this machine can run the program, and says what to do where it cannot."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import platform
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from app.common.settings import DEFAULT_PORT
+
+if TYPE_CHECKING:
+    from app.common.settings import Settings
+
+HELP = "test whether this machine can run the program"
+GB = 1e9
+MEMORY = 2.0 * GB  # bytes; the worker and the web process of a drive of an hour, and a browser
+#: Bytes; an hour of scans of a LiDAR with 16 beams, recorded and mapped.
+DISK = 5.0 * GB
+CORES = 2  # the worker and the web process
+#: Seconds since 1970 of 2026-01-01: a clock before it was never set.
+EARLIEST_S = 1_767_225_600
+_SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
+#: A module of each optional extra of the package, and what it is for.
+EXTRAS = {
+    "e57": ("pye57", "E57 clouds"),
+    "ouster": ("ouster", "raw packets of Ouster"),
+    "dds": ("cyclonedds", "ROS 2 live over plain DDS"),
+    "dask": ("distributed", "many runs on a cluster"),
+    "gis": ("geopandas", "GIS files, DXF, XLSX and GeoTIFF"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Result of one test.
+
+    Attributes:
+        name: What was tested.
+        found: What was found.
+        remedy: What to do; "" if all is well.
+        is_needed: Whether the program needs it; else the remedy is only an offer.
+    """
+
+    name: str
+    found: str
+    remedy: str = ""
+    is_needed: bool = True
+
+    def __str__(self) -> str:
+        state = "ok" if not self.remedy else f"TO DO: {self.remedy}" if self.is_needed else self.remedy
+        return f"{self.name}: {self.found}: {state}"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add no argument."""
+    parser.epilog = (
+        "A line per test ends with ok or with what to do. Exit code 1: something must be done (TO DO);\n"
+        "extras are an offer. The settings in the environment count, see stemmap serve --help."
+    )
+
+
+def run(_arguments: argparse.Namespace) -> int:
+    """Print a line per test.
+
+    Returns:
+        Exit code: 1 if something that the program needs is missing, else 0.
+
+    Raises:
+        StemmapError: A setting in the environment is wrong.
+    """
+    from app.common.settings import from_environment
+
+    checks = all_checks(from_environment())
+    print("\n".join(map(str, checks)))
+    return int(any(check.remedy and check.is_needed for check in checks))
+
+
+def all_checks(settings: Settings) -> list[Check]:
+    """Return the results of all tests.
+
+    Args:
+        settings: Settings of the deployment: folder, address and port.
+    """
+    return [
+        memory_check(available_memory()),
+        cores_check(usable_cores()),
+        instructions_check(compile_target()),
+        *folder_checks(settings.folder),
+        clock_check(time.time()),
+        port_check(settings.host, settings.port),
+        *extra_checks(),
+    ]
+
+
+def memory_check(free: int | None) -> Check:
+    """Return whether enough memory is free.
+
+    Args:
+        free: Free memory [bytes]; None if it is unknown.
+    """
+    if free is None:
+        return Check("memory", "the free memory is unknown on this system")
+    need = f"free {MEMORY / GB:.0f} GB: end other programs, or use a machine with more memory"
+    return Check("memory", f"{free / GB:.1f} GB are free", "" if free >= MEMORY else need)
+
+
+def available_memory() -> int | None:
+    """Return the memory that programs can still use [bytes], by Linux's estimate and the limit of the control
+    group; None if it is unknown."""
+    try:
+        text = Path("/proc/meminfo").read_text(encoding="ascii")
+        free = next(
+            int(line.split()[1]) * 1024 for line in text.splitlines() if line.startswith("MemAvailable")
+        )
+    except (OSError, ValueError, StopIteration):
+        return None
+    try:
+        group = Path("/sys/fs/cgroup")
+        limit = int((group / "memory.max").read_text(encoding="ascii"))
+        used = int((group / "memory.current").read_text(encoding="ascii"))
+    except (OSError, ValueError):  # no control group, or no limit ("max")
+        return free
+    return min(free, max(limit - used, 0))
+
+
+def usable_cores() -> int:
+    """Return the number of cores on which this process may run."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def cores_check(cores: int) -> Check:
+    """Return whether there are enough cores.
+
+    Args:
+        cores: Number of usable cores.
+    """
+    need = f"use a machine with {CORES} cores; with one, the page is slow while a run is mapped"
+    return Check(
+        "processor", f"{cores} usable core{'s' if cores != 1 else ''}", "" if cores >= CORES else need
+    )
+
+
+def compile_target() -> str | None:
+    """Return the target for which kernels are compiled on this processor: x86-64-v3 or generic ARMv8; None
+    if it has other instructions."""
+    import numba
+
+    from pipeline.jit import fix_target
+
+    fix_target()
+    return numba.config.CPU_NAME or None
+
+
+def instructions_check(target: str | None) -> Check:
+    """Return whether compiled kernels of a wheel fit the processor.
+
+    Args:
+        target: See `compile_target`.
+    """
+    machine = platform.machine()
+    if target is not None:
+        return Check("instructions", f"{machine}, compiled for {target}")
+    need = "the first start takes minutes, because kernels are compiled here"
+    return Check("instructions", f"{machine} without the level x86-64-v3", need, is_needed=False)
+
+
+def folder_checks(folder: Path | None) -> list[Check]:
+    """Return whether the data folder can be written and has room.
+
+    Args:
+        folder: The data folder, which need not exist; None for none.
+    """
+    if folder is None:
+        return [Check("data folder", "none: runs are lost at the end", "name one with STEMMAP_FOLDER")]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"stemmap")
+    except OSError as error:
+        need = "make it writable, or name another with STEMMAP_FOLDER"
+        return [Check("data folder", f"{folder}: {error.strerror}", need)]
+    free = shutil.disk_usage(folder).free
+    need = (
+        f"{DISK / GB:.0f} GB are needed for an hour of scans: delete old runs, or name another STEMMAP_FOLDER"
+    )
+    return [
+        Check("data folder", f"{folder} can be written"),
+        Check("disk", f"{free / GB:.1f} GB are free there", "" if free >= DISK else need),
+    ]
+
+
+def clock_check(now_s: float) -> Check:
+    """Return whether the clock can be right.
+
+    Args:
+        now_s: Present time [s since 1970].
+    """
+    found = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
+    if now_s < EARLIEST_S:
+        return Check("clock", found, "set the clock: names of recordings and expiry of links depend on it")
+    return Check("clock", found + (", synchronised" if _SYNCHRONISED.exists() else ""))
+
+
+def port_check(host: str, port: int | None) -> Check:
+    """Return whether the server can listen.
+
+    Args:
+        host: Address on which it listens.
+        port: Its port; None for the default port or one of the next, 0 for any.
+    """
+    number = DEFAULT_PORT if port is None else port
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(family) as listener:
+            if sys.platform != "win32":
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind((host, number))
+    except OSError as error:
+        need = "end the program that listens there, or choose another: stemmap serve --port N"
+        if port is None:
+            need = "nothing: one of the next ports is used; --port N chooses one"
+        return Check("port", f"{host}:{number}: {error.strerror}", need, is_needed=port is not None)
+    return Check("port", f"{host}:{number} is free")
+
+
+def extra_checks(find: Callable[[str], object] = importlib.util.find_spec) -> list[Check]:
+    """Return whether each optional extra is installed.
+
+    Args:
+        find: Returns None for a module that is not installed.
+    """
+    return [
+        Check(
+            f"extra {name}",
+            purpose,
+            "" if find(module) is not None else f"not installed; uv sync --extra {name} adds it",
+            is_needed=False,
+        )
+        for name, (module, purpose) in EXTRAS.items()
+    ]
