@@ -35,6 +35,7 @@ from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
 from pipeline.map_faults import MapFaults, reasons_of
 from pipeline.odometry.gyro import UNUSED, fused
 from pipeline.slam import FastSlam, Motion, SlamState
+from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.measured_pose import REJECTED, within_gate
 from pipeline.slam.motion import noise_of, step_covariance
 from pipeline.slam.particle_ancestry import TrajectoryBuffer
@@ -216,6 +217,17 @@ class Mapper:
         """The estimated path so far, one row per scan. Later paths may have other earlier rows, because of
         corrections; a path that was returned never changes."""
         return self._path.path(self._slam.state.path)
+
+    @property
+    def graph(self) -> KeyframeGraph:
+        """The graph of keyframes so far; immutable."""
+        return self._slam.state.graph
+
+    @property
+    def tree_landmarks(self) -> Int:
+        """Birth number of the landmark of each tree of the last frame, int64, shape (T,), -1 for none; a
+        copy."""
+        return self._tracker.tracks.landmark.copy()
 
     @property
     def height_map(self) -> HeightMap:

@@ -305,7 +305,7 @@ class FastSlam:
         support = 0.0 if without is None else graph.support(revisit, without)
         whole, graph = graph, graph.without(revisit)
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance, self.path())
-        solution = graph.solve(new_loop=True)
+        solution = graph.solve(added=1)
         if solution is None:
             return None
         moved = corrected_landmarks(state.map_of(state.best), graph, solution, path)

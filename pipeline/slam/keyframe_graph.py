@@ -204,7 +204,9 @@ class KeyframeGraph:
         )
         return graph.thinned() if len(graph.keyframes) > KEYFRAMES_MAX else graph
 
-    def with_loop(self, anchor: int, T_map_base: Pose2, covariance: Float, path: Float) -> KeyframeGraph:
+    def with_loop(
+        self, anchor: int, T_map_base: Pose2, covariance: Float, path: Float, *, end: int | None = None
+    ) -> KeyframeGraph:
         """Return the graph with a loop from an earlier keyframe to the newest one; unchanged with fewer than
         two keyframes.
 
@@ -215,6 +217,7 @@ class KeyframeGraph:
             covariance: Covariance of x, y [m], yaw [rad] of this pose, axes of the map, shape (3, 3).
             path: Estimated pose of each scan, x, y [m], yaw [rad], shape (N, 3). The trees around the anchor
                 are mapped from it; `pose` is that of single particles until the first solution.
+            end: Scan of the keyframe at `T_map_base` in place of the newest one.
         """
         if len(self.keyframes) < 2:
             return self
@@ -223,7 +226,7 @@ class KeyframeGraph:
         motion = composed(inverse(pose[None]), T_map_base.as_array()[None])[0]
         c, s = np.cos(pose[2]), np.sin(pose[2])
         C = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        scans = (self.keyframes[row].scan, self.keyframes[-1].scan)
+        scans = (self.keyframes[row].scan, self.newest_scan if end is None else end)
         return replace(self, loops=(*self.loops, LoopEdge(scans, motion, C @ covariance @ C.T)))
 
     def first_birth_after(self, scan: int) -> int:
@@ -363,20 +366,20 @@ class KeyframeGraph:
         solved = int(np.searchsorted(rows, self.solved))
         return replace(self, keyframes=tuple(kept), pose=self.pose[rows], loops=loops, solved=solved)
 
-    def solve(self, *, new_loop: bool = False) -> Solution | None:
+    def solve(self, *, added: int = 0) -> Solution | None:
         """Return the minimum next to the present poses. None with fewer than two keyframes, if the problem is
         singular, if a covariance is not positive definite, or if no step decreases the cost. After
         ITERATIONS_MAX steps the best estimate so far is the result. The graph is unchanged.
 
         Args:
-            new_loop: Whether the last loop was just added and has its full weight, without the kernel, which
-                has no slope far from the minimum.
+            added: Number of loops at the end that have their full weight, without the kernel, which has no
+                slope far from the minimum: a loop that was just added, or those of a person.
         """
         if len(self.keyframes) < 2:
             return None
         try:
             problem = Problem(self)
-            minimum = problem.minimum(quadratic_loops=int(new_loop))
+            minimum = problem.minimum(quadratic_loops=added)
             if minimum is None:
                 return None
             pose, stem, normal = minimum

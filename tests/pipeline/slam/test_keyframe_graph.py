@@ -146,7 +146,7 @@ def test_a_wrong_association_is_switched_off():
 
 def with_full_weight_first(graph):
     """The solution from where the loop has its full weight, as when a loop is closed."""
-    return replace(graph, pose=graph.solve(new_loop=True).pose).solve()
+    return replace(graph, pose=graph.solve(added=1).pose).solve()
 
 
 @pytest.mark.parametrize("shift", [0.0, 3.0])
@@ -166,7 +166,7 @@ def test_the_support_is_the_number_of_revisits_that_fit(drift):
     revisit, known = graph.revisit(3), 16.0 if drift == 0.0 else 0.0
     assert graph.support(revisit, graph.solve()) == pytest.approx(known, abs=1.0)
     closed = graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3), graph.pose)
-    first = closed.solve(new_loop=True)
+    first = closed.solve(added=1)
     assert off(first.pose, true)[-1] < 0.1
     # The trees of the second visit get the names of the first one.
     again = replace(closed.renamed(np.arange(100, 104), np.arange(4)), pose=first.pose)
@@ -176,7 +176,7 @@ def test_the_support_is_the_number_of_revisits_that_fit(drift):
 def test_a_loop_corrects_the_drift_of_the_way_between():
     true = arc(42)
     bare = graph_of(true, np.random.default_rng(3), STEMS[:0])
-    loop = bare.with_loop(0, Pose2(*true[-1]), 1e-6 * np.eye(3), bare.pose).solve(new_loop=True)
+    loop = bare.with_loop(0, Pose2(*true[-1]), 1e-6 * np.eye(3), bare.pose).solve(added=1)
     assert off(loop.pose, true)[-1] < 0.01
     assert off(loop.pose, true).mean() < 0.7 * off(bare.pose, true).mean()
 
@@ -361,7 +361,7 @@ def test_loops_stay_at_their_scans_when_the_graph_is_thinned():
     thin = graph.thinned()
     assert len(thin.keyframes) == 24
     assert thin.loops[0].scans == (5, 39)
-    one, other = graph.solve(new_loop=True), thin.solve(new_loop=True)
+    one, other = graph.solve(added=1), thin.solve(new_loop=True)
     # The noise of the dropped keyframes is the same, but spread over fewer motions.
     np.testing.assert_allclose(other.pose, one.pose[np.searchsorted(graph.scans, thin.scans)], atol=0.02)
 

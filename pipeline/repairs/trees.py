@@ -1,0 +1,138 @@
+"""Repairs of trees: the row of each kind in the table of trees."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.geometry.columns import rows_of
+from pipeline.repairs.record import GATE, Repair, nearest_tree
+from pipeline.types.records import Float, Int, Trees
+
+#: Numbers of trees that a repair adds begin here; no map of scans has so many trees.
+FIRST_ADDED = 100_001
+SIDES = 36  # sectors of `Trees.sides`
+
+
+def repaired_trees(trees: Trees, repair: Repair, added: int) -> tuple[Trees, str]:
+    """Return the trees after a repair of trees, and why it does not apply, "" if it does.
+
+    Args:
+        trees: The trees; not changed.
+        repair: A repair that is not of a loop.
+        added: Number of a tree that a split adds.
+    """
+    x, y = repair.places[0]
+    becomes_tree = repair.value == "tree"
+    row = nearest_tree(trees, repair.places[0], confirmed=not becomes_tree)
+    if row is None and becomes_tree and nearest_tree(trees, repair.places[0], confirmed=True) is not None:
+        return trees, ""  # it is a tree already
+    if row is None:
+        return trees, f"no {'candidate' if becomes_tree else 'tree'} is within {GATE} m of {x:.2f}, {y:.2f}"
+    match repair.kind:
+        case "merge":
+            other = nearest_tree(trees, repair.places[1], confirmed=True)
+            if other is None:
+                x, y = repair.places[1]
+                return trees, f"no tree is within {GATE} m of {x:.2f}, {y:.2f}"
+            if other == row:
+                return trees, f"both positions are of tree {trees.number[row]}"
+            return merged_trees(trees, np.array([row]), np.array([other])), ""
+        case "split":
+            return _split(trees, row, np.array(repair.places[1]), added), ""
+        case "move":
+            position = trees.position.copy()
+            position[row] = repair.places[1]
+            return replace(trees, position=position), ""
+        case "class":
+            confirmed = trees.confirmed.copy()
+            confirmed[row] = becomes_tree
+            return replace(trees, confirmed=confirmed), ""
+        case _:
+            return rows_of(trees, np.delete(np.arange(len(trees.number)), row)), ""
+
+
+def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:
+    """Return the trees without the rows `others`, each merged into a row of `into`, shape (M,); no row is in
+    both, or twice.
+
+    Position, diameter and height are means weighted by the inverse variances, the eccentricity and the lean
+    by the observations. Observations are added, and the sides that were observed are joined.
+    """
+    if not len(into):
+        return trees
+    a, b = rows_of(trees, into), rows_of(trees, others)
+    inverse = np.linalg.inv(a.covariance) + np.linalg.inv(b.covariance)
+    covariance = np.linalg.inv(inverse)
+    position = np.einsum(
+        "nij,nj->ni",
+        covariance,
+        np.linalg.solve(a.covariance, a.position[:, :, None])[:, :, 0]
+        + np.linalg.solve(b.covariance, b.position[:, :, None])[:, :, 0],
+    )
+    dbh, dbh_sigma = _weighted(a.dbh, a.dbh_sigma, b.dbh, b.dbh_sigma)
+    observed = a.observations + b.observations
+    share = a.observations / np.maximum(observed, 1)
+    coverage, sides = np.maximum(a.coverage, b.coverage), None
+    if a.sides is not None and b.sides is not None:
+        sides = a.sides | b.sides
+        coverage = np.maximum(coverage, np.array([bin(s).count("1") for s in sides]) * (2 * math.pi / SIDES))
+    columns = {
+        "position": position,
+        "covariance": covariance,
+        "dbh": dbh,
+        "dbh_sigma": dbh_sigma,
+        "eccentricity": _mean(a.eccentricity, b.eccentricity, share),
+        "observations": observed,
+        "coverage": np.minimum(coverage, 2 * math.pi),
+        "first_seen_ns": np.minimum(a.first_seen_ns, b.first_seen_ns),
+        "last_seen_ns": np.maximum(a.last_seen_ns, b.last_seen_ns),
+        "confirmed": a.confirmed | b.confirmed,
+        "sides": sides,
+    }
+    if a.height is not None and b.height is not None and a.height_sigma is not None:
+        assert b.height_sigma is not None  # noqa: S101 - both are of one table
+        height = _weighted(a.height, a.height_sigma, b.height, b.height_sigma)
+        columns |= {"height": height[0], "height_sigma": height[1]}
+    if a.lean is not None and b.lean is not None:
+        columns["lean"] = _mean(a.lean, b.lean, share)
+    changed = {}
+    for name, values in columns.items():
+        if values is not None:
+            column = getattr(trees, name).copy()
+            column[into] = values
+            changed[name] = column
+    return rows_of(replace(trees, **changed), np.setdiff1d(np.arange(len(trees.number)), others))
+
+
+def _split(trees: Trees, row: int, place: Float, number: int) -> Trees:
+    """Return the trees with a copy of a row at a position and with another number. The diameters of both are
+    unknown, because that of the row was fitted to both stems."""
+    table = rows_of(trees, np.append(np.arange(len(trees.number)), row))
+    both = [row, len(trees.number)]
+    numbers, position = table.number.copy(), table.position.copy()
+    dbh, dbh_sigma = table.dbh.copy(), table.dbh_sigma.copy()
+    numbers[-1], position[-1] = number, place
+    dbh[both] = dbh_sigma[both] = np.nan
+    return replace(table, number=numbers, position=position, dbh=dbh, dbh_sigma=dbh_sigma)
+
+
+def _weighted(a: Float, sigma_a: Float, b: Float, sigma_b: Float) -> tuple[Float, Float]:
+    """Return means weighted by the inverse variances, and their standard deviations; where one value is NaN,
+    the other one."""
+    weight_a = np.where(np.isfinite(a) & (sigma_a > 0.0), sigma_a**-2.0, 0.0)
+    weight_b = np.where(np.isfinite(b) & (sigma_b > 0.0), sigma_b**-2.0, 0.0)
+    total = weight_a + weight_b
+    known = total > 0.0
+    safe = np.where(known, total, 1.0)
+    mean = (weight_a * np.nan_to_num(a) + weight_b * np.nan_to_num(b)) / safe
+    either = np.where(np.isfinite(a), a, b)
+    return np.where(known, mean, either), np.where(known, safe**-0.5, np.where(np.isfinite(a), sigma_a, sigma_b))
+
+
+def _mean(a: Float, b: Float, share: Float) -> Float:
+    """Return means with the share of `a`; where one value is NaN, the other one."""
+    mean: Float = np.where(np.isnan(a), b, np.where(np.isnan(b), a, share * a + (1.0 - share) * b))
+    return mean
