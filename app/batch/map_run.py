@@ -47,6 +47,8 @@ from pipeline.map_faults import DOUBTFUL
 from pipeline.mapper import Mapper
 from pipeline.odometry.lidar_odometry import LOST
 from pipeline.odometry.odometry_override import OdometryOverride
+from pipeline.repairs.record import Repair, repairs_record, repairs_words, unapplied
+from pipeline.repairs.repaired import MapOfRun, Repairer
 from pipeline.seen_area import SeenArea, SeenRecorder, ViewSelection
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
@@ -71,6 +73,8 @@ class OfflineRun:
             on.
         on_frame: Called with the results of each scan.
         chosen: Topics and mounting that the user chose, see `SourceRequest.kept_choices`.
+        repairs: Repairs that are applied to the map after the last scan. detections.csv and the state for a
+            continuation are without them.
     """
 
     source: Source
@@ -84,6 +88,7 @@ class OfflineRun:
     revisions: tuple[tuple[int, Parameters], ...] = ()
     on_frame: Callable[[Frame, Mapper], None] | None = None
     chosen: dict[str, Any] | None = None
+    repairs: tuple[Repair, ...] = ()
 
 
 @dataclass(slots=True, eq=False)
@@ -160,7 +165,11 @@ def _map(
     seen = SeenRecorder()
     frame, start_ns = _map_scans(plan, mapper, begun, islice(to_map, plan.stop_after), files, stopwatch, seen)
     tally = begun.tally
-    path, truth = mapper.path, _truth(plan, begun)
+    mapped = MapOfRun(
+        replace(frame, ground=mapper.height_map), mapper.path, mapper.graph, mapper.tree_landmarks
+    )
+    repaired = Repairer().repaired(mapped, plan.repairs)
+    frame, path, truth = repaired.frame, repaired.path, _truth(plan, begun)
     evaluation = None
     if truth.trees is not None:
         evaluation = score_map(*as_written(frame.trees, path, start_ns), truth.trees, plan.parameters)
@@ -177,21 +186,25 @@ def _map(
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words
+    if plan.repairs:
+        record["repairs"] = repairs_record(plan.repairs, repaired.problems)
+        record["warnings"] = [*record["warnings"], *unapplied(plan.repairs, repaired.problems)]
     outcome = MappingResult(
         summary=[
             *summary_lines(description.uri, frame, (seconds, metres), evaluation, error),
             f"odometry: {chosen.words}",
             preset_words(plan.preset, plan.parameters),
+            *([repairs_words(plan.repairs, repaired.problems)] if plan.repairs else []),
             *start_lines(begun.sources[-1]),
             *tally.health.summary(),
         ],
-        warnings=tally.warnings(),
+        warnings=[*tally.warnings(), *unapplied(plan.repairs, repaired.problems)],
         losses=losses,
         scan_ms=stopwatch.scan_ms,
         stage_ms=stopwatch.stage_ms,
     )
     further = {
-        "terrain.csv": terrain_text(mapper.height_map),
+        "terrain.csv": terrain_text(frame.ground or mapper.height_map),
         "seen.csv": seen_text(_observed(seen.area(path), earlier)),
     }
     if isinstance(moving, OdometryOverride) and (poses := moving.lidar_poses):

@@ -39,6 +39,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--truth", metavar="FILE", type=Path, help="ground truth trees (CSV) for the scores")
     flags.add_dbh_unit_flag(parser)
     parser.add_argument(
+        "--repairs", metavar="FILE", type=Path, help="repairs of the map that were saved on the page"
+    )
+    parser.add_argument(
         "--as-live",
         action="store_true",
         help="of a recorded live run: map only the scans that were mapped live, for the same map again",
@@ -95,10 +98,12 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
     from app.worker.numba_warmup import compile_ahead
     from app.worker.run import recorded_parameters
     from pipeline.io.ground_truth import read_truth_trees
+    from pipeline.repairs.record import read_repairs
 
     flags.print_warnings(partial_output_warnings(arguments.out))
     flags.refuse_one_step(arguments)
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
+    repairs = read_repairs(arguments.repairs) if arguments.repairs else ()
     saved = None if earlier is None else earlier.saved
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
@@ -145,6 +150,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
                 revisions=revisions,
                 on_frame=mapped,
                 chosen=chosen,
+                repairs=repairs,
             )
             outcome = map_run(plan, arguments.out)
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())

@@ -7,13 +7,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from app.batch.run_edits import SAME_THING
 from app.store.async_store import AsyncStore
-from app.store.records import FRAME, KINDS, SKIPPED, Annotation, Content, StaleError, as_truth
+from app.store.records import FRAME, KINDS, REPAIR, SKIPPED, Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError
+from pipeline.repairs.record import Repair
 from pipeline.types.records import TruthTrees
 
 if TYPE_CHECKING:
@@ -222,6 +224,12 @@ class AnnotationEditor:
         self.against = against
         self.truth = truth_of(self._own, self.rows, against)
         self.changed()
+
+    @property
+    def repairs(self) -> tuple[Repair, ...]:
+        """The repairs of the map, in the order in which they were made."""
+        rows = sorted((row for row in self.others if row.content.kind == REPAIR), key=lambda row: row.id)
+        return tuple(msgspec.convert(row.content.values, Repair) for row in rows)
 
     async def edit(self, run: int, function: Callable[[Store], T]) -> T:
         """Run an edit in the thread of the store, update the annotations, call `changed` (and `edited` if any

@@ -33,6 +33,7 @@ from app.worker import protocol
 from pipeline.config import preset
 from pipeline.config.model import Value
 from pipeline.geometry.columns import GrowingColumns, columns_of
+from pipeline.repairs.record import Repair
 from pipeline.seen_area import SeenRecorder
 from pipeline.types.records import Float, Path, TruthTrees
 
@@ -72,7 +73,9 @@ class Dashboard:
         self.leaving: list[Callable[[], Awaitable[None]]] = []
         self.run_recorder, self.reviewed_runs = RunRecorder(self.store), ReviewedRuns(self.store)
         self.annotation_editor = AnnotationEditor(self.store)
-        self.annotation_editor.changed, self.annotation_editor.edited = self._use_truth, self._mark_edits
+        self.annotation_editor.changed, self.annotation_editor.edited = self._use_edits, self._mark_edits
+        self._repairs_sent: tuple[Repair, ...] = ()
+        self._sending = asyncio.Lock()
         self.live = live
         self.scores = Scores(self._broadcast_score)
         self.status = protocol.Status(state="starting", detail="Starting")
@@ -371,7 +374,8 @@ class Dashboard:
         if not play:
             self._notice = "The mapping process ended and was started again. Press play to start again"
         self._go = False
-        state = self.parameters
+        state, self._repairs_sent = self.parameters, ()
+        await self._send_repairs()
         # Always with the parameters: those sent for a run that was left since did not reach the worker.
         await self.worker.send(
             protocol.Begin(opened.run, state.parameters.model_dump(), state.revision, play)
@@ -395,6 +399,22 @@ class Dashboard:
         self.scene.clear()
         self._use_truth()
         self.selector.tree(None)
+
+    def _use_edits(self) -> None:
+        """Use the annotations as ground truth, see `_use_truth`, and send the worker the repairs if they
+        changed."""
+        self._use_truth()
+        if self.annotation_editor.repairs != self._repairs_sent:
+            self._repairing = asyncio.create_task(self._send_repairs())
+
+    async def _send_repairs(self) -> None:
+        """Send the worker the repairs of the map, unless it has them; nothing before the run is open."""
+        async with self._sending:
+            repairs, run = self.annotation_editor.repairs, self.run
+            if run is None or repairs == self._repairs_sent:
+                return
+            self._repairs_sent = repairs
+            await self.worker.send(protocol.SetRepairs(run, repairs))
 
     def _use_truth(self) -> None:
         """Show the ground truth with the annotations in scene and browsers, and request the score of the map

@@ -37,6 +37,7 @@ from pipeline.io.result_files import (
     terrain_rows,
     tree_rows,
 )
+from pipeline.repairs.record import Repair, repairs_record
 from pipeline.seen_area import SeenArea, SeenRecorder, covered_area
 from pipeline.types.records import Path, Trees, TruthTrees
 
@@ -61,6 +62,7 @@ class ShownRun:
         edits: The annotations, also those of skipped trees and of extensions.
         frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
             none.
+        repairs: The repairs of the map, which `shown` has, with the reasons why some do not apply.
     """
 
     request: SourceRequest
@@ -75,6 +77,7 @@ class ShownRun:
     seen: SeenRecorder
     edits: tuple[Annotation, ...]
     frame: Annotation | None
+    repairs: tuple[Repair, ...] = ()
 
     @classmethod
     def of(cls, dashboard: Dashboard) -> ShownRun:
@@ -95,6 +98,7 @@ class ShownRun:
             dashboard.seen,
             (*editor.rows, *editor.skipped, *editor.others),
             editor.frame,
+            editor.repairs,
         )
 
     @property
@@ -174,7 +178,8 @@ class ShownRun:
         has no digest) and, for a source of one step, those of `OneStep`; `recorded` and `chosen`
         where known; `seed`, `odometry`, `preset`, `changed` and `parameters`; `scans` (0 without a drive),
         `duration_s` and `distance_m`; `trees`, without the rejected ones, and `rejected`, their number;
-        `evaluation`, which reviews do not change, None without ground truth; and those of `_counts`."""
+        `evaluation`, which reviews do not change, None without ground truth; `repairs`, see `repairs_record`,
+        if there are any; and those of `_counts`."""
         status, truth = self.status, truth_in_file(self.truth, self.one_step)
         trees = in_file(self.shown.frame.trees, self.one_step)
         rejected = sum(review == REJECTED for review in self.reviews().values())
@@ -188,6 +193,9 @@ class ShownRun:
             source |= {"unit": self.one_step.unit, "up": self.one_step.up}
             if self.one_step.crs_unit != (1.0, 1.0):
                 source["crs_unit_m"] = list(self.one_step.crs_unit)
+        repairs = {}
+        if self.repairs and len(self.repairs) == len(self.shown.problems):
+            repairs = {"repairs": repairs_record(self.repairs, self.shown.problems)}
         return {
             "stemmap": version(),
             "source": source,
@@ -204,6 +212,7 @@ class ShownRun:
             "trees": int(np.count_nonzero(trees.confirmed)) - rejected,
             "rejected": rejected,
             "evaluation": scores,
+            **repairs,
             **self._counts(scores),
         }
 

@@ -21,6 +21,8 @@ KINDS = ("tree", "pole", "person", "bush", "other")
 SKIPPED = "skipped"
 # Class of the annotation that is the reference system of the map; a run has at most one.
 FRAME = "frame"
+# Class of an annotation that is a repair of the map, a `Repair` in `values`.
+REPAIR = "repair"
 MOST_ANNOTATIONS = 5000
 
 
@@ -45,10 +47,10 @@ class Content:
 
     Attributes:
         x, y: Position in the map [m].
-        kind: Class, one of KINDS, SKIPPED or FRAME, or that of an extension.
+        kind: Class, one of KINDS, SKIPPED, FRAME or REPAIR, or that of an extension.
         dbh: Diameter at breast height [m], None if not measured.
-        values: JSON values of a FRAME, with the record of a `MapFrame` as `frame`, and of classes of
-            extensions; None for KINDS and SKIPPED.
+        values: JSON values of a FRAME, with the record of a `MapFrame` as `frame`, of a REPAIR, with the
+            fields of `Repair`, and of classes of extensions; None for KINDS and SKIPPED.
     """
 
     x: float

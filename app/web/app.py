@@ -29,7 +29,7 @@ from app.web import uploads
 from app.web.auth import AccessTokens, Guard
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
-from app.web.routes import page, parameters, results, run, runs
+from app.web.routes import page, parameters, repairs, results, run, runs
 from app.web.routes.access import Limits, NotPermittedError
 from app.worker.protocol import Open, WorkerBusyError
 from app.worker.supervisor import WorkerProcess
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-_ROUTES = (page, run, runs, parameters, results, annotation_routes, uploads)
+_ROUTES = (page, run, runs, parameters, results, annotation_routes, repairs, uploads)
 ROUTERS = tuple(module.router for module in _ROUTES)
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], "Scene"]

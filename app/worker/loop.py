@@ -261,7 +261,7 @@ class WorkerLoop:
             self._send_opened(opened)
         self._report_when_due(self._clock())
 
-    def _execute(self, command: protocol.Command | protocol.Begin) -> None:
+    def _execute(self, command: protocol.Command | protocol.Begin | protocol.SetRepairs) -> None:
         """Execute a command and send the status. The next scan becomes the anchor of the replay clock. An
         error sets the state "failed"."""
         self._replay.release()
@@ -270,7 +270,7 @@ class WorkerLoop:
         self._guarded(lambda: self._carry_out(command))
         self._report()
 
-    def _carry_out(self, command: protocol.Command | protocol.Begin) -> None:
+    def _carry_out(self, command: protocol.Command | protocol.Begin | protocol.SetRepairs) -> None:
         """Execute a command and show the frame that it returns, if any. Errors of the session pass through,
         and ParameterError for invalid values."""
         session = self._session
@@ -293,6 +293,9 @@ class WorkerLoop:
                 self._open(command)
             case protocol.Begin():
                 self._begin(command)
+            case protocol.SetRepairs(run=run, repairs=repairs):
+                if run == self._run:
+                    self._show(session.set_repairs(repairs))
 
     def _open(self, command: protocol.Open) -> None:
         """Open a source as the next run: send the status "starting" before, and `Opened` once it is open. A
@@ -381,13 +384,26 @@ class WorkerLoop:
         return self._reported is not None and self._reported[0].detail == _COMPILING
 
     def _show(self, frame: Frame | None) -> None:
-        """Queue the frame of the session with the path and the confirmation times; nothing for None."""
-        session, path = self._session, self._session.path
+        """Queue the frame of the session with its repairs, the path and the confirmation times; nothing for
+        None."""
+        session, path, repaired = self._session, self._session.path, self._session.repaired
+        frame = None if frame is None else session.frame
         if frame is not None and path is not None:
             of_trees, counts = session.confirmed_s, session.counts
             odometry_xy = session.odometry_xy[: len(path.x)]
             self._put(
-                protocol.Shown(self._run, session.time_s, frame, 0, path, of_trees, counts, odometry_xy)
+                protocol.Shown(
+                    self._run,
+                    session.time_s,
+                    frame,
+                    0,
+                    path,
+                    of_trees,
+                    counts,
+                    odometry_xy,
+                    () if repaired is None else repaired.problems,
+                    session.loops,
+                )
             )
 
     def _report(self) -> None:

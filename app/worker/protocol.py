@@ -20,6 +20,7 @@ from app.sources.one_step import OneStep
 from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 from pipeline.io.readers.camera import Camera, Picture
+from pipeline.repairs.record import Repair
 from pipeline.types.records import Float, Frame, Int, Path, Trees, TruthTrees
 
 # Beyond any run, and well inside of an int64 of nanoseconds.
@@ -146,6 +147,13 @@ class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
     step: int | None = None
 
 
+class SetRepairs(msgspec.Struct, frozen=True, tag="set_repairs"):
+    """Set the repairs of the map of a run, in their order; ignored if another run is open."""
+
+    run: int
+    repairs: tuple[Repair, ...]
+
+
 class Open(SourceRequest, frozen=True, tag="open"):
     """Close the current run and open this source. Its parameters arrive with `Begin`.
 
@@ -229,6 +237,8 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         confirmed_s: Confirmation time of each tree [s], NaN if unknown; None if all are unknown. Since not
             every scan is displayed, it does not follow from the frames.
         counts: Counts up to this scan; None if they are unknown.
+        problems: Why each of the repairs of `SetRepairs` does not apply; "" if it does.
+        loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
     """
 
     run: int
@@ -239,6 +249,8 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     confirmed_s: Float | None = None
     counts: RunCounts | None = None
     odometry_xy: Float = msgspec.field(default_factory=lambda: np.zeros((0, 2)))
+    problems: tuple[str, ...] = ()
+    loops: Int = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):
@@ -481,7 +493,7 @@ class View(msgspec.Struct, frozen=True, tag="view"):
 
 FromWorker = Opened | Shown | Report | Answer | Remapped | Rough | View
 Question = AskCluster | AskTree | AskCompare | AskCamera | AskTreePicture | AskSection | AskCourse
-ToWorker = Command | Begin | Question
+ToWorker = Command | Begin | SetRepairs | Question
 
 
 M = TypeVar("M")

@@ -38,6 +38,7 @@ from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping.preview import KnownMap, needs_sample, preview_trees, sample_scans
 from pipeline.remapping.rerun import Rerun, ScanCaches
+from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
 #: Returns a mapper of a source for parameters and a seed, see `mapper_of`.
@@ -55,6 +56,8 @@ class Run:
 
     Attributes:
         frame: Result of the current scan; None before the first.
+        graph: Graph of keyframes after the current scan.
+        tree_landmarks: Birth number of the landmark of each tree of `frame`, int64, shape (T,); -1 for none.
         confirmed_s: Time of the first confirmation of each tree of `frame`, shape (T,) [s since the first
             scan], NaN for trees that were never confirmed; None before the first scan.
         current: Index of the current scan; -1 before the first.
@@ -89,6 +92,7 @@ class Run:
         self.stopwatch = Stopwatch()
         self.frame: Frame | None = None
         self.confirmed_s: Float | None = None
+        self.graph, self.tree_landmarks = KeyframeGraph(), np.zeros(0, np.int64)
         self.current = -1
         self.is_bare = False
 
@@ -260,6 +264,7 @@ class Run:
             self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))
         self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
         self._step, self.current = step, step.index
+        self.graph, self.tree_landmarks = mapper.graph, mapper.tree_landmarks
         self._map.add(frame, free, spent)
         self.confirmed_s = self._map.confirmed(frame.trees)
         return self.frame

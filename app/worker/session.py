@@ -39,7 +39,10 @@ from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SHOWN_NS, PictureSource
 from pipeline.io.readers.topics import COMPRESSED_IMAGE, IMAGE
 from pipeline.odometry.odometry_override import OdometryOverride
-from pipeline.types.records import Float, Frame, Path, Trees
+from pipeline.repairs.record import Repair
+from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer, loops_of
+from pipeline.slam.keyframe_graph import KeyframeGraph
+from pipeline.types.records import Float, Frame, Int, Path, Trees
 from pipeline.types.units import SECOND_NS
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
@@ -89,6 +92,9 @@ class Session:
         self._target = SeekTarget()
         self._kept: Shown | None = None  # the sought scan, as long as the mapper is on its way to it
         self._comparison = MapComparison()
+        self._repairs: tuple[Repair, ...] = ()
+        self._repairer = Repairer()
+        self._repaired: tuple[Frame, RepairedMap] | None = None  # of the frame before the repairs
         self._remaps_on_arrival = False
         self._warnings: dict[str, None] = {}
         self.on_preview: Callable[[int, Trees], None] = lambda _revision, _trees: None
@@ -108,14 +114,55 @@ class Session:
 
     @property
     def frame(self) -> Frame | None:
-        """Frame of the current scan, or of the sought scan if it was mapped; None if there is no run, or
-        before its first scan."""
+        """Frame of the current scan, or of the sought scan if it was mapped, with the repairs; None if there
+        is no run, or before its first scan."""
+        repaired = self.repaired
+        if repaired is not None:
+            return repaired.frame
         shown = self._kept or self._run
         return shown.frame if shown else None
 
     @property
+    def repaired(self) -> RepairedMap | None:
+        """The map with the repairs; None without repairs, and without a map. While the run plays or a scan is
+        sought, loops are repaired by an earlier solution."""
+        shown, run = self._kept or self._run, self._run
+        if not self._repairs or shown is None or shown.frame is None or run is None:
+            return None
+        if self._repaired is not None and self._repaired[0] is shown.frame:
+            return self._repaired[1]
+        of_drive = isinstance(run, Run) and self._kept is None
+        graph, landmarks = KeyframeGraph(), np.full(len(shown.frame.trees.number), -1)
+        if isinstance(run, Run) and of_drive:
+            graph, landmarks = run.graph, run.tree_landmarks
+        found = self._repairer.repaired(
+            MapOfRun(shown.frame, shown.path, graph, landmarks),
+            self._repairs,
+            hurried=self._state == "playing" or self._target.sought,
+        )
+        self._repaired = (shown.frame, found)
+        return found
+
+    @property
+    def loops(self) -> Int:
+        """Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2)."""
+        repaired = self.repaired
+        if repaired is not None:
+            return repaired.loops
+        return loops_of(self._run.graph if isinstance(self._run, Run) else KeyframeGraph())
+
+    def set_repairs(self, repairs: tuple[Repair, ...]) -> Frame | None:
+        """Set the repairs of the map and return the frame of the current scan with them; None before the
+        first scan."""
+        self._repairs, self._repaired = repairs, None
+        return self.frame
+
+    @property
     def path(self) -> Path | None:
         """Path up to the scan of `frame`, without rows before its first scan; None if there is no run."""
+        repaired = self.repaired
+        if repaired is not None:
+            return repaired.path
         shown = self._kept or self._run
         return shown.path if shown else None
 
@@ -129,8 +176,12 @@ class Session:
     def confirmed_s(self) -> Float | None:
         """Confirmation time of each tree of `frame`, shape (T,) [s since the first scan], NaN for trees that
         never were confirmed; None if there is no frame."""
-        shown = self._kept or self._run
-        return shown.confirmed_s if shown else None
+        shown, frame = self._kept or self._run, self.frame
+        known = shown.confirmed_s if shown else None
+        if shown is None or known is None or shown.frame is None or frame is None or frame is shown.frame:
+            return known
+        of = dict(zip(shown.frame.trees.number.tolist(), known.tolist(), strict=True))
+        return np.array([of.get(number, np.nan) for number in frame.trees.number.tolist()], np.float64)
 
     @property
     def counts(self) -> RunCounts | None:
@@ -341,7 +392,8 @@ class Session:
         index, self._kept = self._target.index, None
         if index is None or (index == run.current and run.is_whole):
             return None
-        if run.parameters_at(index) == self._parameters:
+        loops = any(repair.is_of_loop for repair in self._repairs)  # the graph of that scan is not stored
+        if run.parameters_at(index) == self._parameters and not loops:
             self._kept = run.kept(index)
         return self.frame if self.is_shown else None
 
@@ -408,6 +460,7 @@ class Session:
         if done is None:
             return None
         frame, confirmed_s = done
+        frame = self.frame or frame
         changes = self._comparison.changes(shown, frame, self._revision, self.time_s, confirmed_s)
         if self._robot is not None:
             self._robot.use_parameters(self._revision, 0, run.parameters_at(0))
@@ -460,6 +513,7 @@ class Session:
         self._warnings.clear()
         self._target.forget()
         self._kept = None
+        self._repairs, self._repairer, self._repaired = (), Repairer(), None
 
     def end_recording(self) -> bool:
         """Finish the recording of a live run, which waits up to 8 s for the disk, and return whether the run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path as FilePath
 from typing import Any, Literal, get_args
 
 import msgspec
@@ -91,6 +92,49 @@ def parse_repairs(text: str, where: str) -> tuple[Repair, ...]:
         if repair.problem:
             raise SourceError(f"repair {number}: {repair.problem}", where=where, remedy=remedy)
     return repairs
+
+
+def repairs_record(repairs: Sequence[Repair], problems: Sequence[str]) -> dict[str, Any]:
+    """Return repairs for run.json: `applied`, a dict from kinds to numbers of repairs; and `not_applied`, a
+    list of dicts with the fields of the repair and `problem`.
+
+    Args:
+        repairs: The repairs.
+        problems: Why each does not apply; "" if it does.
+    """
+    applied: dict[str, int] = {}
+    for repair, problem in zip(repairs, problems, strict=True):
+        if not problem:
+            applied[repair.kind] = applied.get(repair.kind, 0) + 1
+    left = [
+        {**msgspec.to_builtins(repair), "problem": problem}
+        for repair, problem in zip(repairs, problems, strict=True)
+        if problem
+    ]
+    return {"applied": dict(sorted(applied.items())), "not_applied": left}
+
+
+def repairs_words(repairs: Sequence[Repair], problems: Sequence[str]) -> str:
+    """Return how many repairs apply, as text; arguments as in `repairs_record`."""
+    return f"repairs: {len(repairs) - sum(map(bool, problems))} of {len(repairs)} applied"
+
+
+def unapplied(repairs: Sequence[Repair], problems: Sequence[str]) -> list[str]:
+    """Return a warning for each repair that does not apply; arguments as in `repairs_record`."""
+    return [
+        f"repair {number} ({repair.kind}) does not apply: {problem}"
+        for number, (repair, problem) in enumerate(zip(repairs, problems, strict=True), start=1)
+        if problem
+    ]
+
+
+def read_repairs(file: FilePath) -> tuple[Repair, ...]:
+    """Return the repairs of a file; raises SourceError if it cannot be read, see `parse_repairs`."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"the file cannot be read: {error}", where=str(file)) from None
+    return parse_repairs(text, str(file))
 
 
 def seen_from(trees: Trees, path: Path, place: tuple[float, float]) -> tuple[int, tuple[float, float]] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,8 +67,8 @@ def loops_of(graph: KeyframeGraph) -> Int:
 class Repairer:
     """Applies repairs to the results of one run; the same results and repairs give the same map.
 
-    The repair of the loops is remembered, since it takes up to a second. While the run goes on it is extended,
-    and computed again once the graph has grown by the share GROWN.
+    The repair of the loops is remembered, since it takes up to a second. While the run goes on it is
+    extended, and computed again once the graph has grown by the share GROWN.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class Repairer:
             hurried: Whether an earlier repair of the loops may be extended.
         """
         frame, path, correction, loops = run.frame, run.path, None, loops_of(run.graph)
-        of_loop = iter(())
+        of_loop: Iterator[str] = iter(())
         if of_loops := tuple(repair for repair in repairs if repair.is_of_loop):
             fixed, known = self._loops(run, of_loops, hurried=hurried)
             loops, of_loop = loops_of(fixed.graph), iter(fixed.problems)
@@ -101,9 +101,7 @@ class Repairer:
                 problems.append(problem)
         return RepairedMap(replace(frame, trees=trees), path, tuple(problems), loops, correction)
 
-    def _loops(
-        self, run: MapOfRun, repairs: tuple[Repair, ...], *, hurried: bool
-    ) -> tuple[LoopRepair, Path]:
+    def _loops(self, run: MapOfRun, repairs: tuple[Repair, ...], *, hurried: bool) -> tuple[LoopRepair, Path]:
         """Return the repair of the loops and the path before it, which may be that of an earlier scan."""
         if self._known is not None:
             of, graph, path, fixed = self._known
@@ -291,7 +289,7 @@ def _moved_ground(ground: HeightMap, correction: PathCorrection) -> HeightMap:
     most views stays."""
     if not len(ground.place):
         return ground
-    centre = (ground.place + 0.5) * ground.cell
+    centre: Float = (ground.place.astype(np.float64) + 0.5) * ground.cell
     moved, _ = correction.moved(centre, _nearest_scans(centre, correction.before))
     place = ground.place + np.round((moved - centre) / ground.cell).astype(np.int32)
     order = np.argsort(-ground.views, kind="stable")

@@ -128,8 +128,8 @@ def _weighted(a: Float, sigma_a: Float, b: Float, sigma_b: Float) -> tuple[Float
     known = total > 0.0
     safe = np.where(known, total, 1.0)
     mean = (weight_a * np.nan_to_num(a) + weight_b * np.nan_to_num(b)) / safe
-    either = np.where(np.isfinite(a), a, b)
-    return np.where(known, mean, either), np.where(known, safe**-0.5, np.where(np.isfinite(a), sigma_a, sigma_b))
+    either, sigma = np.where(np.isfinite(a), a, b), np.where(np.isfinite(a), sigma_a, sigma_b)
+    return np.where(known, mean, either), np.where(known, safe**-0.5, sigma)
 
 
 def _mean(a: Float, b: Float, share: Float) -> Float:

@@ -11,6 +11,7 @@ import { distance, nearest } from "../core/nearest.js";
 import { clusters, isDrive, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { openStory } from "../explain/story.js";
+import { drawRepairs, repairClick, repairHover, tool } from "../repair/repairs.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { drawMap, treeAt } from "./draw.js";
 import { boundsOf, MapCanvas } from "./map_canvas.js";
@@ -33,6 +34,7 @@ const map = new MapCanvas(canvas, {
     drawMap(pen, view, state, isRejected);
     ofExtensions("drawOnMap", pen, view);
     drawAnnotations(pen, view);
+    drawRepairs(pen, view);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
     canvas.setAttribute("aria-label", `Map: ${trees().length} trees${isDrive() ? " and the robot's path" : ""}. The table below lists the trees.${measured}`);
   },
@@ -40,9 +42,9 @@ const map = new MapCanvas(canvas, {
     press: (at) => byTool("press", at, map.view) || measuring() || grab(at, map.view),
     drag: (at, travelled) => byTool("drag", at, map.view, travelled) || drag(at, map.view, travelled),
     release: () => byTool("release") || drop(),
-    hover: (at) => byTool("hover", at, map.view) || (measuring() ? measureTowards(snapped(at)) : hoverAt(at, map.view)),
+    hover: (at) => byTool("hover", at, map.view) || repairHover(at, map.view) || (measuring() ? measureTowards(snapped(at)) : hoverAt(at, map.view)),
     click: (at) => {
-      if (byTool("click", at, map.view)) return;
+      if (byTool("click", at, map.view) || repairClick(at, map.view)) return;
       if (measuring()) measureAt(snapped(at));
       else if (!clickAt(at, map.view, treeAt(trees(), at, map.view))) choose(at);
     },
@@ -68,7 +70,7 @@ function describe(at) {
   }
   canvas.classList.toggle("hits", Boolean(tree ?? cluster ?? truth));
   if (measuring()) return state.measure.from === null ? "Click where the distance begins" : "";
-  if (draft.adding || byTool("busy") || !(tree ?? truth ?? cluster)) return "";
+  if (draft.adding || tool.kind || byTool("busy") || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isDrive() ? seenText(tree) : `height ${heightText(tree)}`);
   else if (cluster) lines.push(`${isDrive() ? "Cluster" : "Candidate"}: ${cluster.verdict === "tree" && isDrive() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);

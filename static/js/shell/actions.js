@@ -10,6 +10,7 @@ import { setLoop } from "../playback/event_marks.js";
 import { advance, togglePlay } from "../playback/timeline.js";
 import { toggleFocus } from "../scene/focus.js";
 import { toggleFollow } from "../scene/layers.js";
+import { useTool } from "../repair/repairs.js";
 import { closeOver, openOver } from "../scene/overlay.js";
 import { pressInScene } from "../scene/scene.js";
 import { openSearch } from "../tune/panel.js";
@@ -84,6 +85,8 @@ export const ACTIONS = [
   ["Annotate: delete the chosen annotation", "del", "", inAnnotate(() => document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "Delete", bubbles: true }))), "", "remove erase"],
   ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: redo your last edit", "", "", inAnnotate(redoEdit)],
   ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],
+  ...[["merge two trees", "merge"], ["split a tree", "split"], ["move a tree", "move"], ["the same place was seen twice: close a loop", "tie"], ["forbid a wrong loop", "forbid"]].map(([text, kind]) =>
+    [`Repair: ${text}`, "", "", edits(() => { toTab("repair")(); useTool(kind); }), null, "mend correct fix edit map"]),
   ["Clear the selection; close the overlay of the scene", "esc", "Escape", leave],
   ["Layout: exchange map and scene", "x", "x", exchange, "exchange map and scene"],
   ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],

@@ -4,6 +4,7 @@ import { ANNOTATE_KEYS, annotateKey } from "../annotate/panel.js";
 import { byId, el, recall, remember } from "../core/dom.js";
 import { capital } from "../core/format.js";
 import { edits, looksOnly } from "../core/permissions.js";
+import { REPAIR_KEYS, repairKey } from "../repair/panel.js";
 import { advance } from "../playback/timeline.js";
 import { toggleLayer } from "../scene/layers.js";
 import { onSceneLoad, pressInScene } from "../scene/scene.js";
@@ -38,7 +39,7 @@ function act(event, inScene) {
     if (inScene && ["f", "t", "b"].includes(event.key)) take(); // keys of viser
     return;
   }
-  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || ofExtensions("pressed", event).some(Boolean) || tuneKey(event))) {
+  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || repairKey(event) || ofExtensions("pressed", event).some(Boolean) || tuneKey(event))) {
     take();
     return;
   }
@@ -61,7 +62,7 @@ function act(event, inScene) {
 
 function sheet() {
   const own = ACTIONS.filter(([, keys, , , text]) => keys && text !== "").map(([title, keys, , , text]) => [keys, text ?? title]);
-  return [["ctrl+k", "search all actions"], ...own, ["1 … 0", "show or hide a layer of the scene"], ...ANNOTATE_KEYS];
+  return [["ctrl+k", "search all actions"], ...own, ["1 … 0", "show or hide a layer of the scene"], ...ANNOTATE_KEYS, ...REPAIR_KEYS];
 }
 
 export function startKeys() {

@@ -21,6 +21,7 @@ import { startFocus } from "../scene/focus.js";
 import { startLabels } from "../scene/labels.js";
 import { startLayers } from "../scene/layers.js";
 import { startOverlay } from "../scene/overlay.js";
+import { startRepairPanel } from "../repair/panel.js";
 import { startScenePanel } from "../scene/panel.js";
 import { startScene } from "../scene/scene.js";
 import { startStages } from "../scene/stages.js";
@@ -39,7 +40,7 @@ import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
-for (const start of [startTheme, startLayout, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
+for (const start of [startTheme, startLayout, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startRepairPanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
   startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startWelcome, startShare, startExtensions]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

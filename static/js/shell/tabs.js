@@ -4,7 +4,7 @@ import { byId, el, recall, remember } from "../core/dom.js";
 import { changed } from "../core/store.js";
 import { ofExtensions } from "./extensions.js";
 
-export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "scores", "charts"];
+export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "repair", "scores", "charts"];
 let current = NAMES[0];
 
 export const visible = (name) => name === current;

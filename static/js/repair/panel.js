@@ -1,0 +1,106 @@
+// The tab Repair: tools for trees and loops, and the list of repairs.
+
+import { draft, redo, undo } from "../annotate/annotations.js";
+import { button, byId, el, setText } from "../core/dom.js";
+import { count } from "../core/format.js";
+import { on, selectedTree, state } from "../core/store.js";
+import { CLASSES, deleteTree, endTool, hint, importRepairs, removeRepair, repairing, repairs, setClass, startRepairs, tool, useTool } from "./repairs.js";
+
+const TOOLS = [
+  ["merge", "Merge", "Two trees of the map are one: the second one becomes part of the first"],
+  ["split", "Split", "A tree of the map is two stems; their diameters are unknown then"],
+  ["move", "Move", "A tree stands elsewhere"],
+];
+const LOOPS = [
+  ["tie", "Same place", "The robot was at one place twice and the map does not know it: click a stem, and the same stem seen again. Path and map follow"],
+  ["forbid", "Forbid loop", "A loop of the map is wrong: click its dashed line. Path and map follow"],
+];
+const WORDS = {
+  merge: "two trees merged", split: "tree split", move: "tree moved", class: "class", delete: "tree deleted", tie: "same place", forbid: "loop forbidden",
+};
+const LARGEST_FILE = 900_000; // [bytes]
+
+function build() {
+  const kind = el("select", { id: "repair-class", "aria-label": "Class of the selected tree", onchange: () => { setClass(kind.value); kind.value = ""; } },
+    el("option", { value: "", text: "Class …" }), ...CLASSES.map((each) => el("option", { value: each, text: each })));
+  const file = el("input", { id: "repair-file", type: "file", accept: ".json,application/json", hidden: true, "aria-label": "File of repairs", onchange: async () => {
+    const [chosen] = file.files;
+    file.value = "";
+    if (!chosen) return;
+    if (chosen.size > LARGEST_FILE) {
+      draft.error = `${chosen.name} is larger than ${LARGEST_FILE / 1e6} MB.`;
+      return fill();
+    }
+    await importRepairs(await chosen.text());
+  } });
+  const tools = (list) => list.map(([name, text, title]) => button(`repair-${name}`, text, title, () => useTool(name)));
+  byId("panel-repair").replaceChildren(
+    el("div", { class: "annotate-head" },
+      el("p", { id: "repair-count", class: "annotate-count" }),
+      button("repair-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("repair-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
+    el("div", { class: "annotate-tools", role: "group", "aria-label": "Repair trees" }, el("span", { class: "dim", text: "Trees" }), ...tools(TOOLS), kind,
+      button("repair-delete", "Delete", "The selected tree is no tree of this map (Del)", deleteTree)),
+    el("div", { class: "annotate-tools", role: "group", "aria-label": "Repair loops" }, el("span", { class: "dim", text: "Loops" }), ...tools(LOOPS)),
+    el("p", { id: "repair-hint", class: "note", role: "status" }),
+    el("p", { id: "repair-error", class: "error", role: "alert", hidden: true }),
+    el("ol", { id: "repairs", class: "repairs" }),
+    el("div", { class: "annotate-files" },
+      button("repair-import", "Import", "Add the repairs of a file that was saved here", () => file.click()), file,
+      el("a", { id: "repair-save", class: "small", href: "/api/repairs.json", download: "repairs.json", text: "Save repairs", title: "A file for Import and for `stemmap map --repairs`" })));
+}
+
+function lineOf(row, problem) {
+  const gone = el("button", { class: "quiet small", text: "✕", title: "Delete this repair", "aria-label": `Delete repair ${row.id}`, "data-edit": true, onclick: () => removeRepair(row) });
+  const place = ["tie", "forbid"].includes(row.kind) ? "" : ` at ${row.places[0].map((v) => v.toFixed(1)).join(", ")}`;
+  const text = `${WORDS[row.kind]}${row.value ? ` ${row.value}` : ""}${place}`;
+  return el("li", { "data-repair": row.id, class: problem ? "problem" : "" },
+    el("span", { class: "grow" }, text, ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
+    el("span", { class: "dim", text: row.who }), gone);
+}
+
+function fill() {
+  if (!repairing()) return;
+  const rows = [...repairs()].sort((a, b) => a.id - b.id), problems = state.map?.problems ?? [];
+  const known = problems.length === rows.length; // else the map does not have them yet
+  const left = known ? problems.filter(Boolean).length : 0;
+  setText(byId("repair-count"), rows.length ? `${count(rows.length, "repair")}${left ? `, ${left} not applied` : ""}` : "No repairs");
+  byId("repair-undo").disabled = !draft.undo;
+  byId("repair-redo").disabled = !draft.redo;
+  const blocked = Boolean(state.annotations?.problem) || !state.map;
+  for (const [name] of [...TOOLS, ...LOOPS]) {
+    byId(`repair-${name}`).disabled = blocked;
+    byId(`repair-${name}`).setAttribute("aria-pressed", String(tool.kind === name));
+  }
+  for (const id of ["repair-class", "repair-delete"]) byId(id).disabled = blocked || !selectedTree();
+  const tree = selectedTree();
+  setText(byId("repair-hint"), hint() || (tree ? `Tree ${tree.number} is selected.` : "Select a tree on the map, or press a tool. The recording is unchanged; each repair can be undone."));
+  setText(byId("repair-error"), state.annotations?.problem || draft.error);
+  byId("repair-error").hidden = !byId("repair-error").textContent;
+  const list = byId("repairs"), now = JSON.stringify([rows.map(({ id, version }) => [id, version]), known && problems]);
+  if (list.dataset.now === now) return; // the focus stays in the list
+  list.dataset.now = now;
+  list.replaceChildren(...rows.map((row, k) => lineOf(row, known ? problems[k] : "")).reverse());
+}
+
+export const REPAIR_KEYS = [["del", "in the tab Repair: delete the selected tree from the map"]];
+
+// Returns whether the key belonged to the tab.
+export function repairKey(event) {
+  if (!repairing()) return false;
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
+    if (event.shiftKey) redo();
+    else undo();
+    return true;
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey) return false;
+  if (event.key === "Escape") return endTool();
+  if (event.key !== "Delete" || !selectedTree()) return false;
+  deleteTree();
+  return true;
+}
+
+export function startRepairPanel() {
+  build();
+  startRepairs();
+  on("map annotations annotating selection tab", fill);
+}
