@@ -26,6 +26,7 @@ from pipeline.slam.keyframe_graph import (
     Solution,
     corrected_path,
 )
+from pipeline.slam.places import REVISIT_DISTANCE
 from pipeline.types.records import Int, Path
 
 #: Path before a tied scan from which on known landmarks are associated anew [m]: half of REVISIT_DISTANCE;
@@ -73,6 +74,10 @@ def with_loops(graph: KeyframeGraph, path: Path, repairs: tuple[Repair, ...]) ->
     for repair in sorted(repairs, key=lambda each: each.kind == "tie"):
         if len(graph.keyframes) < 2 or repair.stamps_ns[1] > path.stamp_ns[-1]:
             problems.append("the run has not come to this place yet")
+            continue
+        ends = [_keyframe(graph, path, stamp) for stamp in repair.stamps_ns]
+        if ends[0] == ends[1]:
+            problems.append("both ends are the same part of the path")
             continue
         if repair.kind == "forbid":
             found = _without_loop(graph, path, repair)
@@ -140,8 +145,6 @@ def _tied(
     order = np.argsort(repair.stamps_ns, kind="stable")
     rows = [_keyframe(graph, path, repair.stamps_ns[k]) for k in order]
     stems = np.array([_in_map(path, poses, repair.stamps_ns[k], repair.places[k]) for k in order])
-    if rows[0] == rows[1]:
-        return graph, None
     turn, sigma = _rotation(graph, poses, rows, stems)
     T_map_stem = Pose2(float(stems[0, 0]), float(stems[0, 1]), turn)
     x, y, yaw = poses[graph.keyframes[rows[1]].scan].tolist()
@@ -149,29 +152,48 @@ def _tied(
     covariance = np.diag(np.square([CLICK, CLICK, sigma]))
     T_map_base, R = through(T_map_stem, covariance, T_stem_base, OWN)
 
-    way = [k.distance for k in graph.keyframes]
-    begin = max(way[rows[1]] - AROUND, 0.5 * (way[rows[0]] + way[rows[1]]))
-    first = graph.keyframes[int(np.searchsorted(way, begin))]
-    revisit = Revisit(first.first_birth, first.distance)
-    whole, graph = graph, graph.without(revisit)
+    way = np.array([k.distance for k in graph.keyframes])
+    revisits = _revisits(graph, way[rows])
+    whole = graph
+    for revisit in revisits:
+        graph = graph.without(revisit)
     anchor, end = (graph.keyframes[row].scan for row in rows)
     graph = graph.with_loop(anchor, T_map_base, R, poses, end=end)
     solution = graph.solve(added=ties + 1)
-    reach, length = AROUND, way[-1]
+    reach = AROUND
     while solution is not None:
         graph = replace(graph, pose=solution.pose)
         near = [k.birth for k in graph.keyframes if abs(k.distance - way[rows[1]]) <= reach]
-        pairs = _same_places(solution, revisit.first_birth, np.unique(np.concatenate(near)))
+        pairs = _same_places(solution, revisits, np.unique(np.concatenate(near)))
         if len(pairs):
             graph = graph.renamed(pairs[:, 0], pairs[:, 1])
             solution = graph.solve(added=ties + 1)
-        if reach > length:
+        if reach > way[-1]:
             break
         reach *= 2.0
     if solution is None:
         return whole, None
-    graph = graph.with_known(whole, revisit, solution)
+    for revisit in revisits:
+        graph = graph.with_known(whole, revisit, solution)
     return graph, replace(graph, pose=solution.pose).solve(added=ties + 1)
+
+
+def _revisits(graph: KeyframeGraph, tied: Float) -> list[Revisit]:
+    """Return the parts of the path whose associations with landmarks from before are not trusted: those with
+    landmarks of the place that the robot left, from where it may have come back to it; and those with all
+    landmarks, from AROUND before the later tied keyframe on.
+
+    Args:
+        graph: The graph.
+        tied: Distances driven until the tied keyframes, ascending, shape (2,) [m].
+    """
+    way = np.array([k.distance for k in graph.keyframes])
+    half = 0.5 * float(tied.sum())
+    left = min(tied[0] + REVISIT_DISTANCE, half)
+    back = max(float(tied[1]) - AROUND, half)
+    begins = ((left, min(left + REVISIT_DISTANCE, back)), (back, back))
+    rows = [(int(np.searchsorted(way, known)), begin) for known, begin in begins]
+    return [Revisit(graph.keyframes[row].first_birth, begin) for row, begin in rows]
 
 
 def _in_map(path: Path, poses: Float, stamp_ns: int, place: tuple[float, float]) -> Float:
@@ -229,18 +251,24 @@ def _stems_around(graph: KeyframeGraph, poses: Float, row: int) -> Float:
     return np.column_stack([np.bincount(of, place[:, a], len(names)) / count for a in range(2)])
 
 
-def _same_places(solution: Solution, first_birth: int, near: Int) -> Int:
-    """Return pairs of birth numbers, shape (P, 2), the first ascending: landmarks begun at `first_birth` or
-    later that are among `near`, and the earlier ones within TWICE of them, one to one."""
+def _same_places(solution: Solution, revisits: list[Revisit], near: Int) -> Int:
+    """Return pairs of birth numbers, shape (P, 2), the first ascending: landmarks that are among `near` and
+    were begun after those that a revisit knows, and these within TWICE of them, one to one; each landmark is
+    in pairs of the first such revisit only."""
     from pipeline.evaluation import match
 
-    young = np.flatnonzero((solution.birth >= first_birth) & np.isin(solution.birth, near))
-    old = np.flatnonzero(solution.birth < first_birth)
-    if not len(young) or not len(old):
-        return np.zeros((0, 2), np.int64)
-    of = match(solution.position[young], solution.position[old], TWICE)
-    again = of >= 0
-    return np.column_stack([solution.birth[young[again]], solution.birth[old[of[again]]]])
+    found: Int = np.zeros((0, 2), np.int64)
+    for revisit in revisits:
+        free = ~np.isin(solution.birth, found)
+        is_known = solution.birth < revisit.first_birth
+        young = np.flatnonzero(~is_known & free & np.isin(solution.birth, near))
+        old = np.flatnonzero(is_known & free)
+        if len(young) and len(old):
+            of = match(solution.position[young], solution.position[old], TWICE)
+            again = of >= 0
+            pairs = np.column_stack([solution.birth[young[again]], solution.birth[old[of[again]]]])
+            found = np.concatenate([found, pairs])
+    return found[np.argsort(found[:, 0])]
 
 
 def corrected_from(before: Float, after: Float, path: Float) -> PathCorrection:

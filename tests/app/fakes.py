@@ -20,6 +20,7 @@ from pipeline.front_end import SegmentedScan, StageTimer, no_timer
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.mapper import Mapper
+from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.types.records import (
     Clusters,
     Detections,
@@ -110,6 +111,7 @@ class FakeMapper:
         self.parameters = parameters
         self._state = FakeState(seed, ())
         self._timer = timer
+        self.graph, self.tree_landmarks = KeyframeGraph(), np.full(4, -1)
 
     def segment(self, step: Step) -> SegmentedScan:
         nothing = np.zeros((0, 3), np.float32)

@@ -329,8 +329,8 @@ RESET = """async () => {
     headers: { "Content-Type": "application/json" } });
   await send("POST", "/api/loop", { from_s: null, to_s: null });
   await send("POST", "/api/command", { type: "set_speed", factor: 1 });
-  const { run, trees, skipped } = await (await fetch("/api/annotations")).json();
-  for (const { id, version } of [...trees, ...skipped])
+  const { run, trees, skipped, others } = await (await fetch("/api/annotations")).json();
+  for (const { id, version } of [...trees, ...skipped, ...(others.repair ?? [])])
     await send("DELETE", `/api/annotations/${id}`, { run, version, browser: "c".repeat(32), who: "reset" });
 }"""
 

@@ -35,6 +35,10 @@ def run(arguments: argparse.Namespace) -> int | None:
         return None
     if arguments.stop_after is not None:
         raise ParameterError("a whole cloud has no scans", remedy="Remove --stop-after")
+    if arguments.repairs is not None:
+        raise ParameterError(
+            "the map of a whole cloud is repaired on the page", remedy="Remove --repairs, and export there"
+        )
     from app.batch.run_folder import check_folder, partial_output_warnings
     from app.cli.map import print_result
     from app.extensions.clouds.inventory import SECTION

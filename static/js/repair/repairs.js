@@ -76,9 +76,13 @@ function gapTo([px, py], view, [a, b]) {
   return Math.hypot(px - ax - t * dx, py - ay - t * dy);
 }
 
-// Returns whether the click belonged to a tool.
+// Returns whether the click belonged to the tab; without a tool it selects.
 export function repairClick(at, view) {
-  if (!repairing() || !tool.kind) return false;
+  if (!repairing()) return false;
+  if (!tool.kind) {
+    select(treeAt(trees(), at, view)?.number ?? null);
+    return true;
+  }
   if (tool.kind === "forbid") {
     const loop = nearest(loops(), (each) => gapTo(at, view, each), LOOP_REACH);
     if (loop) finish({ kind: "forbid", scans: loop });

@@ -527,3 +527,24 @@ def test_the_program_ends_with_the_code_and_all_it_said(tmp_path, library):
 @pytest.mark.parametrize(("warning", "code"), [(f"{LOST} since 1.2 s: no scan fits", 3), ("of no harm", 0)])
 def test_a_map_whose_odometry_got_lost_ends_with_exit_code_3(warning, code, tmp_path):
     assert map_command.print_result([], tmp_path, [warning], {}, replaces=False, wrong=(LOST,)) == code
+
+
+def test_a_file_of_repairs_is_applied_to_the_map(mapped, tmp_path, capsys):
+    before = [line.split(",") for line in (mapped / "trees.csv").read_text().splitlines()[1:]]
+    x, y = map(float, before[0][1:3])
+    file = tmp_path / "repairs.json"
+    gone, nowhere = {"kind": "delete", "places": [[x, y]]}, {"kind": "delete", "places": [[500, 0]]}
+    file.write_text(json.dumps({"repairs": [gone, nowhere]}))
+    told = stemmap(capsys, "map", "sim:paper?duration=4", "--out", tmp_path / "out", "--repairs", str(file))
+    assert "repairs: 1 of 2 applied" in told.out
+    assert "repair 2 (delete) does not apply: no tree is within 0.5 m of 500.00, 0.00" in told.err
+    after = (tmp_path / "out" / "trees.csv").read_text().splitlines()[1:]
+    assert [line.split(",") for line in after] == before[1:]
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["repairs"]["applied"] == {"delete": 1}
+    assert record["repairs"]["not_applied"][0]["problem"].startswith("no tree is within")
+    assert record["trees"] == len(before) - 1
+    file.write_text("{}")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "other", "--repairs", str(file)).refused(
+        1, "these are no repairs of a map"
+    )

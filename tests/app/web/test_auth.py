@@ -112,6 +112,9 @@ ROUTES = [
     ("PUT", "/api/annotations/against"),
     ("GET", "/api/annotations.csv"),
     ("GET", "/api/annotations.geojson"),
+    ("POST", "/api/repairs"),
+    ("POST", "/api/repairs/import"),
+    ("GET", "/api/repairs.json"),
     ("GET", "/no/such/route"),
 ]
 MISSES = {("GET", "/static/index.html"), ("GET", "/static/no-such-file.js")}

@@ -1,0 +1,93 @@
+"""Repairs of the map through the API: the worker gets them in their order, and they are undone, saved and
+imported."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import httpx
+
+from app.worker.protocol import SetRepairs
+from tests.app.dashboard.test_annotations import ANN, edit, show, until
+from tests.app.fakes import FakeWorker
+from tests.app.server_for_tests import BEARER, running
+
+
+async def repair(client: httpx.AsyncClient, where: str = "", **body: Any) -> httpx.Response:
+    run = (await client.get("/api/annotations")).json()["run"]
+    return await client.post(f"/api/repairs{where}", json={"run": run, **ANN, **body})
+
+
+def sent(worker: Any) -> tuple[Any, ...]:
+    assert isinstance(worker, FakeWorker)
+    found = [command.repairs for command in worker.commands if isinstance(command, SetRepairs)]
+    return found[-1] if found else ()
+
+
+async def test_repairs_are_stored_sent_in_their_order_and_undone() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        x, y = dashboard.shown.frame.trees.position[0].tolist()  # type: ignore[union-attr]
+        assert (await repair(client, kind="move", places=[[x, y], [x + 1.0, y]])).status_code == 201
+        assert (await repair(client, kind="class", places=[[x + 1.0, y]], value="pole")).status_code == 201
+        await until(lambda: len(sent(dashboard.worker)) == 2)
+        assert [each.kind for each in sent(dashboard.worker)] == ["move", "class"]
+        assert (await edit(client, "POST", "/undo")).status_code == 200
+        await until(lambda: len(sent(dashboard.worker)) == 1)
+        assert (await edit(client, "POST", "/redo")).status_code == 200
+        await until(lambda: len(sent(dashboard.worker)) == 2)
+        rows = (await client.get("/api/annotations")).json()["others"]["repair"]
+        assert [row["kind"] for row in rows] == ["move", "class"]
+        await edit(client, "DELETE", f"/{rows[0]['id']}", version=1)
+        await until(lambda: [each.kind for each in sent(dashboard.worker)] == ["class"])
+
+
+async def test_a_tie_stores_the_times_at_which_its_trees_were_seen() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        trees = dashboard.shown.frame.trees  # type: ignore[union-attr]
+        a, b = trees.position[:2].tolist()
+        assert (await repair(client, kind="tie", places=[a, b])).status_code == 201
+        await until(lambda: len(sent(dashboard.worker)) == 1)
+        (tie,) = sent(dashboard.worker)
+        assert set(tie.stamps_ns) <= set(dashboard.path.stamp_ns.tolist())  # type: ignore[union-attr]
+        nowhere = await repair(client, kind="tie", places=[a, [500.0, 0.0]])
+        assert nowhere.status_code == 422
+        assert "no tree" in nowhere.json()["error"]["what"]
+
+
+async def test_repairs_that_are_not_valid_are_refused() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        for body in (
+            {"kind": "delete", "places": []},
+            {"kind": "merge", "places": [[0.0, 0.0]]},
+            {"kind": "class", "places": [[0.0, 0.0]]},
+            {"kind": "delete", "places": [[0.0, 0.0]], "value": "pole"},
+            {"kind": "forbid", "scans": [0]},
+            {"kind": "forbid", "scans": [0, 99]},
+            {"kind": "burn", "places": [[0.0, 0.0]]},
+        ):
+            assert (await repair(client, **body)).status_code == 422, body
+
+
+async def test_saved_repairs_are_imported_once() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        await repair(client, kind="delete", places=[[1.0, 2.0]])
+        await repair(client, kind="forbid", scans=[0, 2])
+        text = (await client.get("/api/repairs.json")).text
+        assert [each["kind"] for each in json.loads(text)["repairs"]] == ["delete", "forbid"]
+        assert (await repair(client, "/import", text=text)).json()["added"] == 0
+        for _ in range(2):
+            await edit(client, "POST", "/undo")
+        assert (await repair(client, "/import", text=text)).json()["added"] == 2
+        assert (await client.get("/api/repairs.json")).text == text
+        wrong = await repair(client, "/import", text='{"repairs": [{"kind": "delete"}]}')
+        assert wrong.status_code == 422
+        assert "repair 1: delete needs 1 positions" in wrong.json()["error"]["what"]

@@ -1,0 +1,151 @@
+"""The tab Repair: each repair by clicks on the map, undone and redone; loops; what does not apply."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened
+from tests.browser.dashboard import Dashboard
+from tests.browser.serving import Server
+from tests.browser.test_annotate import place_of
+
+
+@pytest.fixture
+def person(chromium: Browser, server: Server) -> Iterator[Dashboard]:
+    """A new page on a run without annotations."""
+    with opened(chromium, server.link) as dashboard:
+        dashboard.reset()
+        dashboard.stand()
+        dashboard.until_server("/api/trees", "it.trees.length > 20")
+        dashboard.tab("Repair")
+        expect(dashboard.page.locator("#repairs li")).to_have_count(0)
+        dashboard.page.get_by_role("button", name="Fit").click()
+        dashboard.drawn()
+        yield dashboard
+
+
+def trees(dashboard: Dashboard) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = dashboard.ask("/api/trees")["trees"]
+    return found
+
+
+def click(dashboard: Dashboard, x: float, y: float) -> None:
+    dashboard.page.locator("#map").click(position=place_of(dashboard, x, y))
+
+
+def apart(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The trees with the most room around them."""
+
+    def room(tree: dict[str, Any]) -> float:
+        return min((tree["x"] - o["x"]) ** 2 + (tree["y"] - o["y"]) ** 2 for o in found if o is not tree)
+
+    return sorted(found, key=room, reverse=True)
+
+
+def use(dashboard: Dashboard, name: str) -> None:
+    dashboard.page.keyboard.press("Escape")
+    dashboard.page.locator("#map").press("Escape")  # no tree is selected
+    button = dashboard.page.locator(f"#repair-{name}")
+    button.click()
+    expect(button).to_have_attribute("aria-pressed", "true")
+
+
+def test_each_repair_changes_the_map_and_is_undone_and_redone(person: Dashboard):
+    page, found = person.page, trees(person)
+    a, b, c, d, e, f = apart(found)[:6]
+    listed = page.locator("#repairs li")
+
+    use(person, "merge")
+    expect(page.locator("#repair-hint")).to_contain_text("Click the tree that stays")
+    click(person, a["x"], a["y"])
+    expect(page.locator("#repair-hint")).to_contain_text(f"the same as tree {a['number']}")
+    click(person, b["x"], b["y"])
+    person.until_server("/api/trees", f"!it.trees.some(tree => tree.number === {b['number']})")
+
+    use(person, "split")
+    click(person, c["x"], c["y"])
+    click(person, c["x"] + 0.6, c["y"])
+    person.until_server("/api/trees", f"it.trees.length === {len(found)}")
+    second = max(trees(person), key=lambda tree: tree["number"])
+    assert abs(second["x"] - c["x"] - 0.6) < 0.2
+    assert second["dbh_cm"] is None
+
+    use(person, "move")
+    click(person, d["x"], d["y"])
+    click(person, d["x"] + 1.0, d["y"])
+    person.until_server(
+        "/api/trees", f"it.trees.some(tree => tree.number === {d['number']} && tree.x > {d['x'] + 0.7})"
+    )
+
+    click(person, e["x"], e["y"])
+    expect(page.locator("#repair-hint")).to_contain_text(f"Tree {e['number']} is selected")
+    page.locator("#repair-class").select_option("pole")
+    person.until_server("/api/trees", f"!it.trees.some(tree => tree.number === {e['number']})")
+
+    click(person, f["x"], f["y"])
+    expect(page.locator("#repair-hint")).to_contain_text(f"Tree {f['number']} is selected")
+    page.locator("#map").press("Delete")
+    person.until_server("/api/trees", f"!it.trees.some(tree => tree.number === {f['number']})")
+    expect(listed).to_have_count(5)
+    expect(page.locator("#repair-count")).to_have_text("5 repairs")
+    mended = trees(person)
+
+    # The export has the repaired map and says so; another scan has it too.
+    saved = person.ask("/api/repairs.json")["repairs"]
+    assert [each["kind"] for each in saved] == ["merge", "split", "move", "class", "delete"]
+    person.command({"type": "seek", "time_s": 14.05})
+    person.until_server("/api/status", "it.time_s < 14.1 && it.going_to === ''")
+    person.until_server("/api/trees", f"!it.trees.some(tree => tree.number === {f['number']})")
+    person.stand()
+    person.until_server("/api/trees", f"it.trees.length === {len(mended)}")
+
+    for left in (4, 3, 2, 1, 0):
+        page.locator("#map").press("Control+z")
+        expect(listed).to_have_count(left)
+    person.until_server("/api/trees", f"it.trees.length === {len(found)}")
+    assert [tree["number"] for tree in trees(person)] == [tree["number"] for tree in found]
+    for _ in range(5):
+        page.locator("#repair-redo").click()
+    expect(listed).to_have_count(5)
+    person.until_server("/api/trees", f"it.trees.length === {len(mended)}")
+
+    page.locator("#repairs li button").first.click()  # the newest: the deletion
+    person.until_server("/api/trees", f"it.trees.some(tree => tree.number === {f['number']})")
+
+
+def test_a_tie_bends_the_path_and_is_forbidden_and_undone(person: Dashboard):
+    page, found = person.page, trees(person)
+    module = "import('/static/js/core/store.js')"
+    end = f"() => {module}.then(it => it.state.path.at(-1).slice(0, 2))"
+    loops = f"() => {module}.then(it => it.state.map.loops.length)"
+    before, known = page.evaluate(end), page.evaluate(loops)
+    first = min(found, key=lambda tree: tree["last_seen_s"])
+    last = max((tree for tree in found if tree is not first), key=lambda tree: tree["first_seen_s"])
+    use(person, "tie")
+    click(person, first["x"], first["y"])
+    expect(page.locator("#repair-hint")).to_contain_text("seen again")
+    click(person, last["x"], last["y"])
+    person.eventually(
+        lambda: page.evaluate(loops) == known + 1, lambda: page.locator("#repairs").inner_text()
+    )
+    expect(page.locator("#repairs li")).to_contain_text("same place")
+    assert page.evaluate(end) != before
+    page.locator("#map").press("Control+z")
+    person.eventually(lambda: page.evaluate(end) == before, lambda: page.evaluate(end))
+    use(person, "forbid")
+    expect(page.locator("#repair-hint")).to_contain_text("no loop" if not known else "wrong loop")
+    page.locator("#map").press("Escape")
+    expect(page.locator("#repair-forbid")).to_have_attribute("aria-pressed", "false")
+
+
+def test_a_repair_that_does_not_apply_says_so(person: Dashboard):
+    send = (
+        """([kind, places]) => import('/static/js/repair/repairs.js').then(it => it.add({ kind, places }))"""
+    )
+    person.page.evaluate(send, ["delete", [[500.0, 0.0]]])
+    expect(person.page.locator("#repair-count")).to_have_text("1 repair, 1 not applied")
+    expect(person.page.locator("#repairs li")).to_contain_text("no tree is within 0.5 m of 500.00, 0.00")
