@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -41,7 +42,8 @@ def apart(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The trees with the most room around them."""
 
     def room(tree: dict[str, Any]) -> float:
-        return min((tree["x"] - o["x"]) ** 2 + (tree["y"] - o["y"]) ** 2 for o in found if o is not tree)
+        others = [other for other in found if other is not tree]
+        return min(math.hypot(tree["x"] - other["x"], tree["y"] - other["y"]) for other in others)
 
     return sorted(found, key=room, reverse=True)
 
