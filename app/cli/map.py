@@ -6,7 +6,7 @@ import argparse
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from app.cli import flags
 from pipeline.errors import SourceError
 
 if TYPE_CHECKING:
+    from app.batch.map_run import MappingResult
     from app.batch.saved_run import EarlierRun
     from app.robot.source import LiveSource
     from pipeline.io.readers import Source
@@ -75,8 +76,36 @@ def run(arguments: argparse.Namespace) -> int:
     return map_scans(arguments)
 
 
+def publish(frame: Frame, mapper: Mapper, live: LiveSource | None) -> None:
+    """Publish and record the results of a scan of a live source."""
+    if live is not None:
+        live.mapped(frame, mapper.path)
+
+
 def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) -> int:
-    """Map a run of scans, recorded, simulated or live; return the exit code.
+    """Map a run of scans and print the result; return the exit code. Arguments and errors as in `map_to`."""
+    from app.batch.map_run import WRONG
+
+    outcome, replaces = map_to(arguments, earlier)
+    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
+    times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
+    return print_result(
+        [*outcome.summary, times],
+        arguments.out,
+        outcome.warnings,
+        outcome.losses,
+        replaces=replaces,
+        wrong=WRONG,
+    )
+
+
+def map_to(
+    arguments: argparse.Namespace,
+    earlier: EarlierRun | None = None,
+    on_scan: Callable[[Frame, Mapper, LiveSource | None], None] = publish,
+) -> tuple[MappingResult, bool]:
+    """Map a run of scans, recorded, simulated or live, to the folder --out. Return the result, and whether
+    files of an earlier run were replaced.
 
     With an earlier run, seed and parameters are those of that run unless flags give others. Without flags for
     parameters, a recorded live run is mapped with the parameters of its recording.
@@ -84,6 +113,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
     Args:
         arguments: Arguments of the command.
         earlier: The run whose map this run goes on with; None begins a map.
+        on_scan: Called with the results of each scan, the mapper, and the source if it is live.
 
     Raises:
         StemmapError: The source cannot be read, a flag is wrong or does not fit the source, the start in the
@@ -92,7 +122,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
     """
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
-    from app.batch.map_run import WRONG, OfflineRun, map_run
+    from app.batch.map_run import OfflineRun, map_run
     from app.batch.run_folder import check_folder, partial_output_warnings
     from app.robot.source import LiveSource, open_any
     from app.worker.numba_warmup import compile_ahead
@@ -134,8 +164,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
         with flags.progress_bar(opened.description.scans, "scan", "mapping") as bar:
 
             def mapped(frame: Frame, mapper: Mapper) -> None:
-                if live is not None:
-                    live.mapped(frame, mapper.path)
+                on_scan(frame, mapper, live)
                 bar.update(1)
 
             plan = OfflineRun(
@@ -153,16 +182,7 @@ def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) 
                 repairs=repairs,
             )
             outcome = map_run(plan, arguments.out)
-    stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
-    times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
-    return print_result(
-        [*outcome.summary, times],
-        arguments.out,
-        outcome.warnings,
-        outcome.losses,
-        replaces=replaces,
-        wrong=WRONG,
-    )
+    return outcome, replaces
 
 
 def print_result(

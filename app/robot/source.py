@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -305,7 +305,7 @@ class LiveSource:
         """State of the recording in one line, "" if there is none."""
         return "" if self._recorder is None else self._recorder.status
 
-    def mapped(self, frame: Frame, path: Path) -> None:
+    def mapped(self, frame: Frame, path: Path, also: Mapping[str, bytes] | None = None) -> None:
         """Publish and record the results of a scan, and store its picture if one is due. Path and trees are
         published and recorded at most once per second. Nothing happens without publishing, recording and
         `keep_pictures`.
@@ -313,6 +313,7 @@ class LiveSource:
         Args:
             frame: Results of the scan.
             path: Path up to the scan.
+            also: Further messages in CDR by their topics, see `pipeline.io.recording.messages`.
         """
         if self._camera is not None and self._kept is not None and self._kept.is_due(path):
             picture = self.picture_near(frame.stamp_ns)
@@ -320,7 +321,7 @@ class LiveSource:
                 self._kept.add(picture, path)
         if self._publisher is None and self._recorder is None:
             return
-        messages = scan_messages(frame)
+        messages = scan_messages(frame) | dict(also or {})
         now_s = time.monotonic()
         if now_s >= self._map_at_s + _MAP_PAUSE_S:
             self._map_at_s = now_s

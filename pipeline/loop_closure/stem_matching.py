@@ -236,7 +236,7 @@ def search(
                     if n >= 0 and alike(local_dbh[m], local_dbh_sigma[m], dbh[n], dbh_sigma[n]):
                         found += 1
                 if found >= floor:
-                    kept = _keep(pose, agree, kept, x, y, yaw, found, reach)
+                    kept = keep_hypothesis(pose, agree, kept, x, y, yaw, found, reach)
                     # A hypothesis with fewer than half cannot make the best one ambiguous.
                     floor = max(floor, found // 2 + 1)
                     if kept == KEPT:
@@ -245,7 +245,7 @@ def search(
 
 
 @compiled
-def _keep(
+def keep_hypothesis(
     pose: Float, agree: Int, kept: int, x: float, y: float, yaw: float, found: int, reach: float
 ) -> int:
     """Store a hypothesis; return the number of stored ones. A stored one with the same pose is replaced only
@@ -618,7 +618,7 @@ class _Search:
         self._grid = cells_of(reference.position, REACH)
         rough: Float
         rough, _, self._looked = search(
-            *self._columns(local), _evenly(base), *self._columns(reference), pair, length, *self._grid,
+            *self._columns(local), evenly_ordered(base), *self._columns(reference), pair, length, *self._grid,
             p.slack, REACH, LEAST, self._most,
         )  # fmt: skip
         return rough
@@ -699,7 +699,7 @@ class _Search:
         return stems.position, stems.sigma, stems.dbh, stems.dbh_sigma
 
 
-def _evenly(base: Int32) -> Int32:
+def evenly_ordered(base: Int32) -> Int32:
     """Return at most BASE_PAIRS of the pairs, which are sorted by length, int32, shape (B, 2), in an order in
     which each first part covers all lengths evenly."""
     rows = np.linspace(0, len(base) - 1, min(len(base), BASE_PAIRS)).astype(np.int64)
@@ -715,4 +715,12 @@ def _log10_false_alarms(tests: int, trials: int, hits: int, p: float) -> float:
     return float(np.log10(max(tests, 1)) + max(tail, -300.0))
 
 
-__all__ = ["MapStems", "Match", "Refusal", "find_constellation", "find_displacement"]
+__all__ = [
+    "MapStems",
+    "Match",
+    "Refusal",
+    "evenly_ordered",
+    "find_constellation",
+    "find_displacement",
+    "keep_hypothesis",
+]

@@ -64,6 +64,9 @@ def _parser() -> argparse.ArgumentParser:
         "--hours", metavar="N", type=flags.positive_number(1000.0, "hours"), help="duration of `campaign`"
     )
     parser.add_argument("--scans", metavar="N", type=flags.whole_number(1000, 10**8), help="length of `soak`")
+    parser.add_argument(
+        "--starts", metavar="N", type=flags.whole_number(1, 10**5), help="starts of each pair of `localise`"
+    )
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures as JSON")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
@@ -85,7 +88,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the benchmarks and write docs/benchmarks.md or --out; with --list or --pictures only list them or
-    draw pictures. --seeds, --hours and --scans are passed on by environment variables.
+    draw pictures. --seeds, --hours, --scans and --starts are passed on by environment variables.
 
     Returns:
         Exit code: 1 if a benchmark failed, else 0.
@@ -106,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     day = arguments.date or date.today()
     if arguments.seeds is not None:
         os.environ[VARIABLE] = arguments.seeds
-    for name in ("hours", "scans"):
+    for name in ("hours", "scans", "starts"):
         if (value := getattr(arguments, name)) is not None:
             os.environ[f"STEMMAP_BENCH_{name.upper()}"] = str(value)
     failed = runner.run(arguments.names, out=out, json_file=arguments.json, day=day)

@@ -48,6 +48,7 @@ def merge_runs(
     parameters: Parameters | None,
     *,
     force: bool,
+    match: Match | None = None,
 ) -> MergeResult:
     """Merge run b into run a, and write the files of a run and correspondence.csv; seen.csv only if both runs
     have it. Scores of run a are not part of the result.
@@ -57,6 +58,7 @@ def merge_runs(
         out: Folder for the files.
         parameters: Parameters of the merged map; None for those of run a.
         force: Whether the map of another source may be overwritten.
+        match: Where run b is in run a, with a pose; None finds it by the stems.
 
     Returns:
         Numbers of confirmed trees, and the match of the maps.
@@ -71,9 +73,13 @@ def merge_runs(
     record = read_run_record(folder_a)
     check_folder(out, a.sources[0].digest, force=force)
     trees_a, trees_b = a.map.trees(chosen), b.map.trees(b.chosen_parameters())
-    match = find_constellation(
-        MapStems.of_trees(trees_b), MapStems.of_trees(trees_a), chosen.relocalisation, hypotheses=HYPOTHESES
-    )
+    if match is None:
+        match = find_constellation(
+            MapStems.of_trees(trees_b),
+            MapStems.of_trees(trees_a),
+            chosen.relocalisation,
+            hypotheses=HYPOTHESES,
+        )
     if match.pose is None:
         raise StemmapError(
             f"the two maps do not match with confidence: {match.reason} "

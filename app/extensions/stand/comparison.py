@@ -13,16 +13,16 @@ import shapely
 
 from app.batch.map_frame import WGS84, MapFrame, read_map_frame, reproject
 from app.batch.run_folder import read_run, read_seen_area, read_tree_places
-from app.common.text import count, version
-from app.extensions.stand.parameters import Stand
-from app.extensions.stand.plots import within_reach
-from app.extensions.stand.visits import (
+from app.batch.visits import (
     VisitComparison,
     VisitTrees,
     align_visits,
     compare_visits,
     with_known_sigma,
 )
+from app.common.text import count, version
+from app.extensions.stand.parameters import Stand
+from app.extensions.stand.plots import within_reach
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2

@@ -243,6 +243,7 @@ STEM_HEIGHT, STEM_WIDTH = 1.3, 0.2
 
 POSE, ODOMETRY, PATH, TREES, DETECTIONS = "pose", "odometry", "path", "trees", "detections"
 CLEARANCE, ZONE = "clearance", "zone"
+MAP_ODOM = "map_odom"
 #: Type by topic, below `/stemmap/`.
 TYPES = {
     POSE: "geometry_msgs/msg/PoseStamped",
@@ -252,6 +253,7 @@ TYPES = {
     DETECTIONS: "vision_msgs/msg/Detection3DArray",
     CLEARANCE: "sensor_msgs/msg/Range",
     ZONE: "std_msgs/msg/UInt8",
+    MAP_ODOM: "nav_msgs/msg/Odometry",
 }
 #: Latched topics: late subscribers get the last message.
 LATCHED = (PATH, TREES, DETECTIONS)
@@ -305,6 +307,21 @@ def pose_messages(frame: Frame) -> dict[str, bytes]:
     head, at = _header(frame.stamp_ns), _pose(T)
     stamped = make("geometry_msgs/PoseStamped", header=head, pose=at)
     return {POSE: encode(stamped), ODOMETRY: encode(odometry_of(head, BASE, at, covariance.reshape(-1)))}
+
+
+def map_odom_messages(stamp_ns: int, T_map_odom: Pose3, covariance: NDArray[np.float64]) -> dict[str, bytes]:
+    """Return a dict from MAP_ODOM to a message in CDR: the pose of the frame ODOM in a stored map, with its
+    covariance. A time [ns] that ROS cannot represent is clipped.
+
+    Args:
+        stamp_ns: Time of the scan [ns].
+        T_map_odom: The pose.
+        covariance: Covariance of x, y [m], yaw [rad], shape (3, 3).
+    """
+    full, rows = np.zeros((6, 6)), np.array([0, 1, 5])
+    full[np.ix_(rows, rows)] = covariance
+    at = pose(T_map_odom.t, T_map_odom.quaternion())
+    return {MAP_ODOM: encode(odometry_of(_header(stamp_ns), ODOM, at, full.reshape(-1)))}
 
 
 def map_messages(frame: Frame, path: Path) -> dict[str, bytes]:

@@ -77,7 +77,8 @@ def test_the_hash_of_a_type_is_that_of_ros():
     """The hash of std_msgs/String as ROS 2 prints it in `ros2 topic info --verbose`."""
     known = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
     assert standard_types("cdr").hash_rihs01("std_msgs/msg/String") == known
-    assert len({messages.type_hash(topic) for topic in messages.TYPES}) == len(messages.TYPES)
+    hashes = {messages.type_hash(topic) for topic in messages.TYPES}
+    assert len(hashes) == len(set(messages.TYPES.values()))
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from app.batch.run_folder import read_run
+from app.batch.visits import VisitTrees, compare_visits
 from app.extensions.stand.comparison import read_visit
-from app.extensions.stand.visits import VisitTrees, compare_visits
 from pipeline.geometry.poses import Pose2
 from tests.app.batch.finished_runs import write_run
 from tests.app.cli.test_commands import stemmap

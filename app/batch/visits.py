@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from app.extensions.stand.control_points import fit_rigid_pairs
 from pipeline.config.stages import Relocalisation
 from pipeline.errors import StemmapError
-from pipeline.evaluation import match
+from pipeline.evaluation import fit_rigid, match
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.loop_closure.stem_matching import MapStems, find_constellation
 from pipeline.types.records import Bool, Int
@@ -120,7 +119,7 @@ def compare_visits(
             break
         off = np.hypot(*(a.position[rows_a] - T_a_b.apply(b.position[rows_b])).T)
         near = off <= max(2.5 * float(np.median(off)), 0.02)
-        T_a_b = fit_rigid_pairs(b.position[rows_b[near]], a.position[rows_a[near]]).pose
+        T_a_b = fit_rigid(b.position[rows_b[near]], a.position[rows_a[near]])
     b_of = match(a.position, T_a_b.apply(b.position), reach)
     rows_a, rows_b = _pairs(b_of)
     difference = T_a_b.apply(b.position[rows_b]) - a.position[rows_a]

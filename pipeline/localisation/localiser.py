@@ -1,0 +1,289 @@
+"""Localisation of a driving robot in a stored map: global search, then tracking, and withdrawal of a fix that
+the stems contradict.
+
+The robot is mapped apart from the stored map, in the frame `odom`: that of its own map or odometry. While it
+is not found, the stems of the last metres are searched in the stored map (`search`). A fix gives T_map_odom,
+which is fitted again to the nearby stems whenever the robot has moved. The fix is withdrawn if the stems of
+the last metres show another place.
+
+The stored map is never changed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import binom
+
+from pipeline.geometry.poses import Float, Pose2, Pose3
+from pipeline.localisation.heights import HeightFix, align_heights
+from pipeline.localisation.search import Fix, MapIndex, false_alarms, fix_near, search_map
+from pipeline.localisation.stored_map import StoredMap
+from pipeline.loop_closure.stem_matching import MapStems, Match, worst_sigma
+from pipeline.slam.places import AGREEING, ODDS
+from pipeline.types.records import Bool, Int, Trees
+
+#: Probability that any search of a drive accepts a wrong pose. The k-th search has the share 1 / (k (k + 1)),
+#: so that all shares sum to 1 whatever the length of the drive.
+FALSE_FIX = 1e-6
+MISSED = 0.01  # probability of saying "nothing of this map is here" although it is
+SEARCH_EVERY = 4.0  # m of driven path between two searches
+GROWN = 1.25  # a search also follows when the number of stems has grown by this factor
+TRACK_EVERY = 1.0  # m of driven path between two alignments
+LOCAL = 60.0  # m of driven path, in which the stems of a search were seen; drift bends longer ones
+RECENT = 20.0  # m of driven path, in which the stems of an alignment were seen
+REACH = 30.0  # m around the robot, in which stems of an alignment are
+MOST_STEMS = 120  # of a search, those nearest to the robot
+FEWEST = 5  # stems inside the map from which a fix is judged
+# Drift of the odometry outside of the map: m/sqrt(m) and rad/sqrt(m), those of wheels on soft ground.
+DRIFT_XY, DRIFT_YAW = 0.05, 0.01
+
+
+class State(Enum):
+    """State of a localisation."""
+
+    SEARCHING = "not found yet"
+    FOUND = "found"
+    ABSENT = "nothing of this map is here"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localisation:
+    """Where the robot is in the stored map.
+
+    Attributes:
+        state: The state.
+        T_map_odom: Pose of the local frame in the map; None unless found.
+        covariance: Covariance of x, y [m], yaw [rad] of the base in the map, shape (3, 3), relative to the
+            stems of the map; zeros unless found.
+        stems, of: Number of stems that agree, and of stems that are where the map has stems.
+        residual: Root mean square distance of the stems that agree [m]; NaN without any.
+        height: Height and tilt of the local frame; None if the maps do not tell.
+        driven: Distance driven [m].
+        found_at: Distance driven when it was found [m]; NaN unless found.
+        searches: Number of searches.
+        withdrawn: Number of fixes that were withdrawn.
+        reason: Why the last search found nothing; "" if found or not searched.
+    """
+
+    state: State = State.SEARCHING
+    T_map_odom: Pose2 | None = None
+    covariance: Float = field(default_factory=lambda: np.zeros((3, 3)))
+    stems: int = 0
+    of: int = 0
+    residual: float = math.nan
+    height: HeightFix | None = None
+    driven: float = 0.0
+    found_at: float = math.nan
+    searches: int = 0
+    withdrawn: int = 0
+    reason: str = ""
+
+    @property
+    def text(self) -> str:
+        """The state for people."""
+        if self.state is State.FOUND:
+            sigma = math.sqrt(0.5 * (self.covariance[0, 0] + self.covariance[1, 1]))
+            return f"found: {self.stems} of {self.of} stems agree, {sigma:.2f} m"
+        if self.state is State.SEARCHING and self.withdrawn:
+            return "not found: the stems contradicted the place that was found"
+        return str(self.state.value)
+
+    @property
+    def pose_3d(self) -> Pose3 | None:
+        """Pose of the local frame in the map with height, roll and pitch; they are 0 where `height` is None.
+        None unless found."""
+        if self.T_map_odom is None:
+            return None
+        if self.height is not None:
+            return self.height.pose3(self.T_map_odom)
+        pose = self.T_map_odom
+        return Pose3.from_euler(np.array([pose.x, pose.y, 0.0]), 0.0, 0.0, pose.yaw)
+
+
+class Localiser:
+    """Finds and follows a robot in a stored map.
+
+    Args:
+        stored: The map.
+        slack: Standard deviation of the distortion of a map within a constellation [m].
+    """
+
+    def __init__(self, stored: StoredMap, slack: float = 0.1) -> None:
+        """Prepare the search; a map without stems is never found."""
+        self.stored = stored
+        self.localisation = Localisation()
+        self._slack = slack
+        self._index = MapIndex.of(stored, slack) if len(stored) else None
+        self._terrain = cKDTree(stored.terrain[:, :2]) if len(stored.terrain) else None
+        self._stamp_ns: list[int] = []
+        self._driven: list[float] = []
+        self._pose = Pose2()
+        self._fix: Fix | None = None
+        self._fixed_at = self._next = 0.0
+        self._searched_stems = 0
+
+    def update(
+        self, stamp_ns: int, T_odom_base: Pose2, trees: Trees, terrain: Float | None = None
+    ) -> Localisation:
+        """Add the local map after a scan, and return the localisation.
+
+        Args:
+            stamp_ns: Time of the scan; later than before [ns].
+            T_odom_base: Pose of the robot in the local frame.
+            trees: The local map, in the local frame. Only confirmed trees count.
+            terrain: x, y, z of the cells of the local terrain, shape (K, 3) [m]; None if unknown.
+        """
+        before, self._pose = self._pose, T_odom_base
+        driven = 0.0
+        if self._driven:
+            driven = self._driven[-1] + math.hypot(T_odom_base.x - before.x, T_odom_base.y - before.y)
+        self._stamp_ns.append(stamp_ns)
+        self._driven.append(driven)
+        self.localisation = replace(self.localisation, driven=driven)
+        if self._index is None:
+            return self.localisation
+        if self.localisation.T_map_odom is None:
+            self._search(self._index, trees, terrain)
+        elif driven >= self._next:
+            self._track(self._index, self.localisation.T_map_odom, trees, terrain)
+        return self.localisation
+
+    @property
+    def match(self) -> Match | None:
+        """The present fix as the match of the local map with the stored one; None unless found."""
+        fix = self._fix
+        if fix is None:
+            return None
+        alarms = false_alarms(len(fix.local), max(fix.inside, len(fix.local)), fix.looked, fix.chance)
+        covariance = fix.covariance_at(np.zeros(2))
+        return Match(
+            fix.pose,
+            covariance,
+            None,
+            fix.local,
+            fix.reference,
+            fix.second,
+            max(alarms / math.log(10.0), -300.0),
+        )
+
+    def _search(self, index: MapIndex, trees: Trees, terrain: Float | None) -> None:
+        """Search the stems of the last metres in the map, if enough are new since the last search."""
+        rows = self._recent(trees, LOCAL, MOST_STEMS)
+        driven = self._driven[-1]
+        if len(rows) < FEWEST or (driven < self._next and len(rows) < GROWN * self._searched_stems):
+            return
+        self._next, self._searched_stems = driven + SEARCH_EVERY, len(rows)
+        k = self.localisation.searches + 1
+        level = FALSE_FIX / (k * (k + 1))
+        stems = _stems(trees, rows)
+        fix = search_map(stems, index, self._slack, level)
+        if fix.reason is None and fix.pose is not None:
+            self.localisation = replace(self.localisation, searches=k)
+            self._use(fix, fix.pose, terrain, is_new=True)
+            return
+        absent = _would_be_found(fix, len(stems), level)
+        state = State.ABSENT if absent else State.SEARCHING
+        self.localisation = replace(self.localisation, state=state, searches=k, reason=fix.reason or "")
+
+    def _track(self, index: MapIndex, T_map_odom: Pose2, trees: Trees, terrain: Float | None) -> None:
+        """Fit the pose again to the nearby stems; withdraw it if they contradict it."""
+        self._next = self._driven[-1] + TRACK_EVERY
+        rows = self._recent(trees, RECENT, MOST_STEMS)
+        fix = fix_near(T_map_odom, _stems(trees, rows), index, self._slack)
+        if fix.inside < FEWEST:  # outside of the map
+            self._drift()
+            return
+        if _log_odds(len(fix.local), fix.inside, fix.chance) < -ODDS:
+            self._fix, self._searched_stems = None, 0
+            l10n = self.localisation
+            self.localisation = Localisation(
+                driven=l10n.driven,
+                searches=l10n.searches,
+                withdrawn=l10n.withdrawn + 1,
+                reason="contradicted",
+            )
+            return
+        if fix.pose is not None and len(fix.local) >= FEWEST:
+            self._use(fix, fix.pose, terrain, is_new=False)
+        else:
+            self._drift()
+
+    def _use(self, fix: Fix, pose: Pose2, terrain: Float | None, *, is_new: bool) -> None:
+        """Take over a fix with its pose: new, or an alignment of the present one."""
+        place = np.array([self._pose.x, self._pose.y])
+        self._fix, self._fixed_at = fix, self._driven[-1]
+        self._next = self._driven[-1] + TRACK_EVERY
+        at = pose.apply(place[None])[0]
+        height = (
+            None
+            if terrain is None
+            else align_heights(pose, terrain, self._terrain, self.stored.terrain[:, 2], at)
+        )
+        self.localisation = replace(
+            self.localisation,
+            state=State.FOUND,
+            T_map_odom=pose,
+            covariance=fix.covariance_at(place),
+            stems=len(fix.local),
+            of=max(fix.inside, len(fix.local)),
+            residual=fix.residual,
+            height=self.localisation.height if height is None else height,
+            found_at=self._driven[-1] if is_new else self.localisation.found_at,
+            reason="",
+        )
+
+    def _drift(self) -> None:
+        """Enlarge the covariance of the last fix by the drift since then."""
+        if self._fix is None:
+            return
+        way = self._driven[-1] - self._fixed_at
+        added = np.diag([DRIFT_XY**2 * way, DRIFT_XY**2 * way, DRIFT_YAW**2 * way])
+        place = np.array([self._pose.x, self._pose.y])
+        grown = replace(self._fix, covariance=self._fix.covariance + added)
+        self.localisation = replace(self.localisation, covariance=grown.covariance_at(place), stems=0, of=0)
+
+    def _recent(self, trees: Trees, way: float, most: int) -> Int:
+        """Return the rows of the confirmed trees that were seen in the last `way` metres within REACH of the
+        robot, at most `most`, nearest first."""
+        first = int(np.searchsorted(self._driven, self._driven[-1] - way))
+        seen: Bool = trees.confirmed & (trees.last_seen_ns >= self._stamp_ns[first])
+        rows = np.flatnonzero(seen & np.isfinite(trees.position).all(axis=1))
+        distance = np.hypot(*(trees.position[rows] - [self._pose.x, self._pose.y]).T)
+        order = np.argsort(distance, kind="stable")
+        reach = np.inf if way == LOCAL else REACH
+        nearest: Int = rows[order[distance[order] <= reach][:most]]
+        return nearest
+
+
+def _stems(trees: Trees, rows: Int) -> MapStems:
+    """Return some trees as stems, in the order of the rows."""
+    sigma = worst_sigma(trees.covariance[rows][:, [0, 0, 1], [0, 1, 1]])
+    dbh = trees.dbh[rows]
+    stems = MapStems(trees.position[rows], sigma, dbh, np.where(np.isnan(dbh), np.nan, trees.dbh_sigma[rows]))
+    return stems.take(stems.usable())
+
+
+def _log_odds(k: int, n: int, p: float) -> float:
+    """Return the log odds that k of n stems agree because the robot is there, and not by chance with the
+    probability p; see `places.agreement`."""
+    q = max(AGREEING, p)
+    p = min(max(p, 1e-6), 1.0 - 1e-6)
+    return k * math.log(q / p) + (n - k) * math.log((1.0 - q) / (1.0 - p))
+
+
+def _would_be_found(fix: Fix, n: int, level: float) -> bool:
+    """Return whether a search of n stems that found nothing would have found the place with a probability of
+    1 - MISSED, if the share AGREEING of the stems were in the map."""
+    chance = max(fix.wrong_chance(n), 1e-3)
+    needed = next(
+        (k for k in range(n + 1) if false_alarms(k, n, fix.looked, chance) <= math.log(level)), n + 1
+    )
+    return needed <= n and float(binom.cdf(needed - 1, n, AGREEING)) <= MISSED
+
+
+__all__ = ["Localisation", "Localiser", "State"]

@@ -1,0 +1,446 @@
+"""Global search of a local constellation of stems in a stored map: the best pose and its chance of being
+false.
+
+A pair of local stems is aligned with each pair of the map of equal length. An alignment is compared with an
+occupancy raster of the stems of the map, first near the pair, and dropped by a sequential test (Wald 1945) as
+soon as its stems agree so rarely that it is not the right one. The best alignments are refined with exact
+positions (`stem_matching.partners`), as in `find_constellation`.
+
+The fix is accepted if its agreement is not chance: the number M of alignments that were tried, times the
+probability that as many stems of a wrong pose agree, M P(Binomial(n, p) >= k), is at most the level (number
+of false alarms of the a contrario method, Desolneux, Moisan, Morel 2000). p is the chance that a stem agrees,
+from the density of the map; or, if it is larger, the chance that explains the second best pose as the best of
+M wrong ones, M P(Binomial(n, p) >= k2) = 1. The second best pose therefore tells the chance of this stand: it
+is high where stems stand in rows, and the fitting of the pose is included. The best pose must beat it by the
+same test.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betaincinv
+from scipy.stats import binom
+
+from pipeline.geometry.poses import Float, Pose2, wrap_angle
+from pipeline.jit import compiled
+from pipeline.localisation.stored_map import StoredMap
+from pipeline.loop_closure.stem_matching import (
+    LEAST,
+    REACH,
+    ROUNDS,
+    WIDE,
+    WIDE_ROUNDS,
+    MapStems,
+    aligned,
+    alignment_covariance,
+    alike,
+    cells_of,
+    crowding,
+    evenly_ordered,
+    keep_hypothesis,
+    pairs_within,
+    partners,
+)
+from pipeline.slam.frame_uncertainty import transported_covariance
+from pipeline.slam.places import AGREEING, WINDOW
+from pipeline.types.records import Int, Int32
+
+Blocks = NDArray[np.uint64]
+
+# Length of the pairs, in mean distances of the stems of the map. The heading of a shorter one is off by more
+# than the gate at its neighbours; a longer one has more partners of equal length in the map.
+SHORTEST, LONGEST = 1.0, 2.5
+SPACING = 2.0, 8.0  # m; bounds of the mean distance of stems
+# With 0.4 of the stems seen again, a pair finds the pose with 0.07 (both are seen again, and its neighbours
+# pass the sequential test), and all of 24 pairs fail with 0.18, with 0.5 of the stems with 0.02. The next
+# search has other stems.
+BASE_PAIRS = 24
+FURTHER_PAIRS = 6  # base pairs after the first that finds a pose beyond chance; they find its rivals too
+MOST_PAIRS = 2_000_000  # pairs of the map
+RASTER = 0.25  # m; cell of the occupancy raster
+NEAR = 0.4  # m; a stem agrees with an alignment of a pair within it: 3 sigma of two maps
+MOST_CELLS = 1 << 28  # of the raster, one bit each; larger maps get larger cells
+COUNTED = 24  # local stems nearest to the pair that are compared with the raster
+SEEN_AGAIN = 0.6  # share of the neighbours of a pair that agree, for the sequential test
+DROP = math.log(0.2)  # log of the likelihood ratio at which an alignment is dropped
+REFINED = 12  # alignments that are refined
+KEPT = 48
+SAME_XY, SAME_YAW = 1.0, 0.1  # m, rad; refined poses within both are one place
+#: m; largest standard deviation of a stem relative to its neighbours. That of its position in the map has the
+#: drift of the map, which neighbours share.
+SIGMA = 0.1
+SIGMA_XY, SIGMA_YAW = 0.5, 0.05  # m, rad; largest standard deviations of a fix
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapIndex:
+    """A stored map prepared for searches.
+
+    Attributes:
+        stems: The stems.
+        pair, length: Pairs of stems by length, see `pairs_within`.
+        grid: Grid of the stems, see `cells_of`.
+        low, cell, near: Low corner [m], cell [m] and blocks of 8 x 8 cells of the raster, uint64, shape (W,
+            H): bit 8 i + j is set if cell i, j of the block is within NEAR of a stem.
+        reach: Shortest and longest pair [m].
+        chance: Share of the raster that is occupied around the stems: the chance that a stem agrees.
+    """
+
+    stems: MapStems
+    pair: Int32
+    length: Float
+    grid: tuple[Float, Int32, Int32]
+    low: Float
+    cell: float
+    near: Blocks
+    reach: tuple[float, float]
+    chance: float
+
+    @classmethod
+    def of(cls, stored: StoredMap, slack: float) -> MapIndex:
+        """Return the index of a map with at least one stem.
+
+        Args:
+            stored: The map.
+            slack: Standard deviation of the distortion of a map within a constellation [m].
+        """
+        stems = relative(stored.stems)
+        position = stems.position
+        density, _ = crowding(np.zeros(3), position, position, WINDOW)
+        spacing = min(max(1.0 / math.sqrt(density), SPACING[0]), SPACING[1])
+        reach = SHORTEST * spacing, LONGEST * spacing
+        margin = 2.0 * math.sqrt(4.0 * SIGMA**2 + 2.0 * slack**2)
+        pair, length = pairs_within(position, max(reach[0] - margin, 0.1), reach[1] + margin, MOST_PAIRS)
+        low = position.min(axis=0) - 2.0 * NEAR
+        extent = np.ptp(position, axis=0) + 4.0 * NEAR
+        cell = max(RASTER, math.sqrt(float(np.prod(extent)) / MOST_CELLS))
+        width, height = (np.floor(extent / (8.0 * cell)) + 1.0).astype(np.int64).tolist()
+        near = np.zeros((width, height), np.uint64)
+        occupy(near, position, low, cell, NEAR)
+        chance = min(1.0 - math.exp(-density * math.pi * NEAR**2), 0.5 * SEEN_AGAIN)
+        return cls(stems, pair, length, cells_of(position, REACH), low, cell, near, reach, chance)
+
+
+def relative(stems: MapStems) -> MapStems:
+    """Return stems with standard deviations of at most SIGMA, those relative to their neighbours."""
+    return MapStems(stems.position, np.minimum(stems.sigma, SIGMA), stems.dbh, stems.dbh_sigma)
+
+
+@compiled
+def occupy(near: Blocks, position: Float, low: Float, cell: float, reach: float) -> None:
+    """Set the cells of a raster whose centres are within `reach` [m] of a stem to 1.
+
+    Args:
+        near: Blocks of the raster, uint64, shape (W, H), changed in place; see `MapIndex`.
+        position: Stems, shape (N, 2) [m], at least `reach` inside of the raster.
+        low, cell: Low corner and cell of the raster [m].
+    """
+    wide = int(np.ceil(reach / cell))
+    for k in range(position.shape[0]):
+        x, y = (position[k, 0] - low[0]) / cell, (position[k, 1] - low[1]) / cell
+        for i in range(max(int(x) - wide, 0), min(int(x) + wide + 1, 8 * near.shape[0])):
+            for j in range(max(int(y) - wide, 0), min(int(y) + wide + 1, 8 * near.shape[1])):
+                if (i + 0.5 - x) ** 2 + (j + 0.5 - y) ** 2 <= (reach / cell) ** 2:
+                    near[i >> 3, j >> 3] |= np.uint64(1) << np.uint64(((i & 7) << 3) | (j & 7))
+
+
+@compiled
+def align_pairs(
+    local: Float, local_sigma: Float, local_dbh: Float, local_dbh_sigma: Float, base: Int32,
+    reference: Float, sigma: Float, dbh: Float, dbh_sigma: Float, pair: Int32, length: Float,
+    low: Float, cell: float, near: Blocks,
+    slack: float, hit: float, miss: float, enough: int,
+) -> tuple[Float, Int, int]:  # fmt: skip
+    """Align each base pair with all pairs of the map of equal length, and count the stems that agree.
+
+    Args:
+        local, local_sigma, local_dbh, local_dbh_sigma: Columns of the local stems, see `MapStems`.
+        base: Pairs of local rows, int32, shape (B, 2).
+        reference, sigma, dbh, dbh_sigma: Columns of the stems of the map.
+        pair, length, low, cell, near: See `MapIndex`.
+        slack: See `MapIndex.of`.
+        hit, miss: Change of the log likelihood ratio by a stem that agrees, and by one that does not.
+        enough: Number of stems of the first alignment after which FURTHER_PAIRS base pairs follow.
+
+    Returns:
+        The best distinct poses x, y [m], yaw [rad], shape (K, 3), at most KEPT, in no particular order; the
+        number of counted stems that agree in each, int64, shape (K,); and the number of alignments.
+    """
+    pose, agree = np.empty((KEPT, 3)), np.zeros(KEPT, np.int64)
+    kept, looked, floor = 0, 0, 2
+    count = min(local.shape[0], COUNTED + 2)
+    px, py = np.empty(count), np.empty(count)
+    worst = sigma.max()
+    wide, high = 8.0 * near.shape[0], 8.0 * near.shape[1]
+    last = base.shape[0]
+    for k in range(base.shape[0]):
+        if k >= last:
+            break
+        i, j = base[k, 0], base[k, 1]
+        bx, by = local[j, 0] - local[i, 0], local[j, 1] - local[i, 1]
+        span = np.sqrt(bx * bx + by * by)
+        mx, my = 0.5 * (local[i, 0] + local[j, 0]), 0.5 * (local[i, 1] + local[j, 1])
+        distance2 = (local[:, 0] - mx) ** 2 + (local[:, 1] - my) ** 2
+        distance2[i] = distance2[j] = np.inf
+        order = np.argsort(distance2, kind="mergesort")
+        for m in range(count - 2):
+            px[m], py[m] = local[order[m], 0] - mx, local[order[m], 1] - my
+        variance = local_sigma[i] ** 2 + local_sigma[j] ** 2 + 2.0 * slack * slack
+        widest = 2.0 * np.sqrt(variance + 2.0 * worst * worst)
+        at = np.searchsorted(length, span - widest)
+        while at < length.shape[0] and length[at] <= span + widest:
+            a, b = pair[at, 0], pair[at, 1]
+            off = length[at] - span
+            at += 1
+            if off * off > 4.0 * (variance + sigma[a] ** 2 + sigma[b] ** 2):
+                continue
+            for _ in range(2):
+                a, b = b, a
+                if not (
+                    alike(local_dbh[i], local_dbh_sigma[i], dbh[a], dbh_sigma[a])
+                    and alike(local_dbh[j], local_dbh_sigma[j], dbh[b], dbh_sigma[b])
+                ):
+                    continue
+                looked += 1
+                rx, ry = reference[b, 0] - reference[a, 0], reference[b, 1] - reference[a, 1]
+                scale = 1.0 / (span * np.sqrt(rx * rx + ry * ry))
+                c, s = (bx * rx + by * ry) * scale, (bx * ry - by * rx) * scale
+                x, y = 0.5 * (reference[a, 0] + reference[b, 0]), 0.5 * (reference[a, 1] + reference[b, 1])
+                ux, uy = (x - low[0]) / cell, (y - low[1]) / cell
+                cc, ss = c / cell, s / cell
+                score, found = 0.0, 2
+                for m in range(count - 2):
+                    u = ux + cc * px[m] - ss * py[m]
+                    v = uy + ss * px[m] + cc * py[m]
+                    agrees = False
+                    if 0.0 <= u < wide and 0.0 <= v < high:
+                        iu, iv = int(u), int(v)
+                        bit = np.uint64(((iu & 7) << 3) | (iv & 7))
+                        agrees = (near[iu >> 3, iv >> 3] >> bit) & np.uint64(1) != 0
+                    if agrees:
+                        score += hit
+                        found += 1
+                    else:
+                        score -= miss
+                        if score < DROP:
+                            found = 0
+                            break
+                if found > floor:
+                    yaw = np.arctan2(s, c)
+                    if found >= enough and last == base.shape[0]:
+                        last = min(last, k + 1 + FURTHER_PAIRS)
+                    kept = keep_hypothesis(
+                        pose, agree, kept, x - c * mx + s * my, y - s * mx - c * my, yaw, found, REACH
+                    )
+                    floor = max(floor, found // 2)
+                    if kept == KEPT:
+                        floor = max(floor, int(agree.min()))
+    return pose[:kept], agree[:kept], looked
+
+
+Refusal = Literal["too few stems", "no agreement", "could be chance", "ambiguous", "most stems disagree",
+                  "weakly fixed"]  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """Result of a search, or of an alignment from a known pose.
+
+    Attributes:
+        pose: T_map_local of the best pose; None if there is none.
+        centre: Mean of the local stems in their frame, shape (2,) [m].
+        covariance: Covariance of x, y [m], yaw [rad] in the map of a robot at `centre`, shape (3, 3); zeros
+            without a pose.
+        reason: Why the pose is not accepted; None if it is.
+        local, reference: Rows of the stems that agree, int64, shape (K,).
+        inside: Number of local stems where the map has stems, see `crowding`.
+        second: Number of stems that agree with the second best pose.
+        looked: Number of alignments that were tried.
+        chance: Probability that a stem agrees with a random pose.
+        residual: Root mean square distance of the stems that agree [m]; NaN without a pose.
+    """
+
+    pose: Pose2 | None
+    centre: Float
+    covariance: Float
+    reason: Refusal | None
+    local: Int
+    reference: Int
+    inside: int = 0
+    second: int = 0
+    looked: int = 0
+    chance: float = 0.0
+    residual: float = math.nan
+
+    def covariance_at(self, place: Float) -> Float:
+        """Return the covariance of x, y [m], yaw [rad] in the map of a robot at a position in the local
+        frame, shape (2,) [m], that is exact there: shape (3, 3)."""
+        if self.pose is None:
+            return self.covariance
+        dx, dy = self.pose.rotation() @ (place - self.centre)
+        return transported_covariance(self.covariance, float(dx), float(dy))
+
+    def wrong_chance(self, n: int) -> float:
+        """Return the probability that one of n stems agrees at a wrong pose: `chance`, or the larger one that
+        explains the second best pose."""
+        if not self.second:
+            return self.chance
+        return max(
+            self.chance, float(betaincinv(self.second, n - self.second + 1, 1.0 / max(self.looked, 2)))
+        )
+
+
+def false_alarms(k: int, n: int, looked: int, chance: float) -> float:
+    """Return the natural logarithm of the expected number of wrong poses at which k or more of n stems agree.
+    Two stems, of the pair that was aligned, agree by construction.
+
+    Args:
+        k, n: Numbers of stems.
+        looked: Number of poses that were tried.
+        chance: Probability that a stem agrees.
+    """
+    return math.log(max(looked, 1)) + float(binom.logsf(k - 3, max(n - 2, 1), chance))
+
+
+def _none(reason: Refusal, *, looked: int = 0, inside: int = 0, chance: float = 0.0) -> Fix:
+    """Return a result without a pose."""
+    rows = np.zeros(0, np.int64)
+    return Fix(None, np.zeros(2), np.zeros((3, 3)), reason, rows, rows, inside, 0, looked, chance)
+
+
+def search_map(local: MapStems, index: MapIndex, slack: float, level: float) -> Fix:
+    """Return the pose of local stems in a map, without an initial pose.
+
+    Args:
+        local: Usable stems in their own frame.
+        index: The map.
+        slack: See `MapIndex.of`.
+        level: Expected number of false alarms.
+    """
+    local = relative(local)
+    if min(len(local), len(index.stems)) < LEAST:
+        return _none("too few stems")
+    mean = local.position.mean(axis=0)
+    centred = MapStems(local.position - mean, local.sigma, local.dbh, local.dbh_sigma)
+    base, _ = pairs_within(centred.position, *index.reach, MOST_PAIRS)
+    p, q, counted = index.chance, SEEN_AGAIN, min(len(local) - 2, COUNTED)
+    hits = np.arange(counted + 2)
+    beyond = hits[math.log(1e6) + binom.logsf(hits - 1, counted, p) <= math.log(level)]
+    enough = 2 + int(beyond[0]) if len(beyond) else counted + 3
+    rough, agree, looked = align_pairs(
+        *_columns(centred), evenly_ordered(base)[:BASE_PAIRS],
+        *_columns(index.stems), index.pair, index.length, index.low, index.cell, index.near,
+        slack, math.log(q / p), math.log((1.0 - p) / (1.0 - q)), enough,
+    )  # fmt: skip
+    best_first = np.lexsort((*rough.T, -agree))[:REFINED]
+    refined = [refine(rough[k], centred, index, slack) for k in best_first]
+    refined.sort(key=lambda each: -int(np.count_nonzero(each[1] >= 0)))
+    if not refined or np.count_nonzero(refined[0][1] >= 0) < LEAST:
+        return _none("no agreement", looked=looked)
+    rivals = (o for pose, o in refined[1:] if not _is_same(pose, refined[0][0]))
+    second = int(np.count_nonzero(next(rivals, np.zeros(0)) >= 0))
+    fix = _fix(*refined[0], centred, mean, index, slack, second=second, looked=looked)
+    return _decided(fix, len(local), level)
+
+
+def _is_same(a: Float, b: Float) -> bool:
+    """Return whether two poses of the stems about their mean, shape (3,), are of one place."""
+    turn = abs(float(wrap_angle(a[2] - b[2])))
+    return math.hypot(a[0] - b[0], a[1] - b[1]) <= SAME_XY and turn <= SAME_YAW
+
+
+def _decided(fix: Fix, n: int, level: float) -> Fix:
+    """Return a fix with the reason of its refusal, by the tests of this module; `n` is the number of local
+    stems."""
+    k, sigma = len(fix.local), np.sqrt(np.diag(fix.covariance))
+    reason: Refusal | None = None
+    if not false_alarms(k, n, fix.looked, fix.chance) <= math.log(level):
+        reason = "could be chance"
+    elif not false_alarms(k, n, fix.looked, fix.wrong_chance(n)) <= math.log(level):
+        reason = "ambiguous"
+    elif k < AGREEING * fix.inside:
+        reason = "most stems disagree"
+    elif max(sigma[:2]) > SIGMA_XY or sigma[2] > SIGMA_YAW:
+        reason = "weakly fixed"
+    return replace(fix, reason=reason)
+
+
+def refine(pose: Float, local: MapStems, index: MapIndex, slack: float) -> tuple[Float, Int]:
+    """Return a pose x, y [m], yaw [rad] after pairing and alignment in turns, and the row of the map of each
+    local stem, -1 for none, int64, shape (L,).
+
+    Args:
+        pose: The pose before, shape (3,).
+        local: Local stems, about their mean.
+        index: The map.
+        slack: See `MapIndex.of`.
+    """
+    of, before = np.full(len(local), -1, np.int64), np.full(len(local), -2, np.int64)
+    for k in range(ROUNDS):
+        wide = slack * (WIDE if k < WIDE_ROUNDS else 1.0)
+        found = partners(pose, *_columns(local), *_columns(index.stems), *index.grid, wide, REACH, of)
+        if found < 2 or (k > WIDE_ROUNDS and np.array_equal(of, before)):
+            break
+        at = np.flatnonzero(of >= 0)
+        weight = 1.0 / (local.sigma[at] ** 2 + index.stems.sigma[of[at]] ** 2 + slack**2)
+        pose = aligned(local.position[at], index.stems.position[of[at]], weight)
+        before = of.copy()
+    return pose, of
+
+
+def fix_near(T_map_local: Pose2, local: MapStems, index: MapIndex, slack: float) -> Fix:
+    """Return the pose that fits best near a known one; its reason is None if it is determined, and its
+    agreement is not tested. Arguments as in `search_map`."""
+    local = relative(local)
+    if not len(local):
+        return _none("too few stems")
+    mean = local.position.mean(axis=0)
+    centred = MapStems(local.position - mean, local.sigma, local.dbh, local.dbh_sigma)
+    there = T_map_local @ Pose2(float(mean[0]), float(mean[1]), 0.0)
+    pose, of = refine(there.as_array(), centred, index, slack)
+    if np.count_nonzero(of >= 0) >= 3:
+        return _fix(pose, of, centred, mean, index, slack)
+    density, inside = crowding(there.as_array(), centred.position, index.stems.position, WINDOW)
+    return _none("no agreement", inside=inside, chance=_chance(density, centred, index, slack))
+
+
+def _fix(
+    pose: Float, of: Int, centred: MapStems, mean: Float, index: MapIndex, slack: float,
+    *, second: int = 0, looked: int = 0,
+) -> Fix:  # fmt: skip
+    """Return a refined pose of the stems about their mean as a fix, without a decision."""
+    at = np.flatnonzero(of >= 0)
+    to, reference = of[at], index.stems
+    about_mean = Pose2(*(float(v) for v in pose))
+    T_map_local = about_mean @ Pose2(-float(mean[0]), -float(mean[1]))
+    variance = centred.sigma[at] ** 2 + reference.sigma[to] ** 2 + slack**2
+    try:
+        covariance = alignment_covariance(about_mean, centred.position[at], reference.position[to], variance)
+    except np.linalg.LinAlgError:
+        covariance = np.diag([1e6, 1e6, 1e6])
+    density, inside = crowding(pose, centred.position, reference.position, WINDOW)
+    residual = reference.position[to] - about_mean.apply(centred.position[at])
+    return Fix(
+        T_map_local, mean, covariance, None, at, to, inside, second, looked,
+        _chance(density, centred, index, slack), float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
+    )  # fmt: skip
+
+
+def _chance(density: float, local: MapStems, index: MapIndex, slack: float) -> float:
+    """Return the probability that a local stem has a partner at a random pose, by the density of the map
+    there [1/m^2] and the gate of `partners`."""
+    variance = float(np.mean(local.sigma**2) + np.mean(index.stems.sigma**2)) + slack**2
+    return float(1.0 - np.exp(-density * np.pi * min(9.0 * variance, REACH**2)))
+
+
+def _columns(stems: MapStems) -> tuple[Float, Float, Float, Float]:
+    """Return positions, sigmas, diameters and their sigmas of stems."""
+    return stems.position, stems.sigma, stems.dbh, stems.dbh_sigma
+
+
+__all__ = ["Fix", "MapIndex", "Refusal", "fix_near", "search_map"]

@@ -1,0 +1,228 @@
+"""Drives of stems per frame, mapped from any frame with an odometry that drifts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.config import preset
+from pipeline.geometry.poses import Float, Pose2, Pose3
+from pipeline.io.readers.tree_manager import STEM_FINDER
+from pipeline.localisation import StoredMap
+from pipeline.loop_closure.stem_matching import aligned
+from pipeline.mapper import Mapper
+from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import Int, Odometry, Record, Scan, Stems, Trees
+from tests.benchmarks.tree_manager_folder import perturbed, read_recorded
+
+#: Of the made odometry, as in the benchmark `oxford`: part of a step's length, rad/sqrt(m), rad/m.
+DISTANCE, TURN, BIAS = 0.02, np.radians(0.5), np.radians(0.02)
+NEAR = 25.0  # m; true poses of the stored drive that give the frame of its map at a place
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """Stems of each frame in the frame of the sensor, and its true poses in a frame that all drives share.
+
+    Attributes:
+        name: For tables.
+        stamp_ns: Time of each frame, int64, shape (F,).
+        poses: True poses, one per frame.
+        first: Row of the first stem of each frame, and the number of all stems, shape (F + 1,).
+        stems: Positions, shape (N, 3) [m]; axis, shape (N, 3); dbh, shape (N,) [m].
+    """
+
+    name: str
+    stamp_ns: Int
+    poses: list[Pose3]
+    first: Int
+    stems: tuple[Float, Float, Float]
+
+    @property
+    def truth(self) -> Float:
+        """True x, y [m], yaw [rad] of each frame, shape (F, 3)."""
+        return np.array([pose.planar().as_array() for pose in self.poses])
+
+    @property
+    def driven(self) -> Float:
+        """Distance driven at each frame, shape (F,) [m]."""
+        return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.truth[:, :2], axis=0).T)))
+
+    def seen(self, k: int, reach: float = 15.0) -> Float:
+        """Return the stems of a frame within `reach` [m] by its true pose, shape (S, 2) [m]."""
+        xyz = self.stems[0][int(self.first[k]) : int(self.first[k + 1])]
+        return self.poses[k].apply(xyz[np.hypot(xyz[:, 0], xyz[:, 1]) <= reach])[:, :2]
+
+    def records(self, begin: int, end: int, rng: np.random.Generator) -> Iterator[Record]:
+        """Yield the frames from `begin` to before `end` with a new odometry."""
+        told = perturbed(self.poses[begin:end], distance=DISTANCE, turn=TURN, bias=BIAS, rng=rng)
+        xyz, axis, dbh = self.stems
+        for k, pose in zip(range(begin, end), told, strict=True):
+            rows = slice(int(self.first[k]), int(self.first[k + 1]))
+            stamp = int(self.stamp_ns[k])
+            yield Odometry(stamp, pose)
+            yield Scan(stamp, xyz[rows].astype(np.float32), stems=Stems(axis[rows], dbh[rows]))
+
+    def mapped(self, begin: int, end: int, seed: int) -> Iterator[tuple[int, int, Pose2, Trees]]:
+        """Map frames from a new origin; yield the number of each frame, its time, pose and the trees."""
+        mapper = Mapper(preset("stems"), sensor=STEM_FINDER, T_base_lidar=Pose3.identity(), seed=seed)
+        for step in steps(self.records(begin, end, np.random.default_rng(seed))):
+            frame = mapper.process(step)
+            yield begin + step.index, frame.stamp_ns, frame.estimate.T_map_base, frame.trees
+
+    def map(self, seed: int) -> Reference:
+        """Map the whole drive."""
+        mapper = Mapper(preset("stems"), sensor=STEM_FINDER, T_base_lidar=Pose3.identity(), seed=seed)
+        frame = None
+        for step in steps(self.records(0, len(self.poses), np.random.default_rng(seed))):
+            frame = mapper.process(step)
+        assert frame is not None
+        path = mapper.path
+        poses = np.stack([path.x, path.y, path.yaw], axis=1)
+        return Reference(self.name, StoredMap.of(frame.trees), self.truth, poses)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """A stored map, with the true and the estimated poses x, y [m], yaw [rad] of its drive, shape (F, 3)."""
+
+    name: str
+    stored: StoredMap
+    truth: Float
+    path: Float
+
+    def covers(self, places: Float, within: float = 10.0) -> bool:
+        """Return whether the drive passed near each true position, shape (N, 2) [m]."""
+        d2 = ((places[:, None] - self.truth[None, :, :2]) ** 2).sum(axis=2)
+        return bool(np.all(d2.min(axis=1) <= within**2))
+
+    def there(self, truth: Float) -> Pose2 | None:
+        """Return the pose in the stored map at a true pose x, y [m], yaw [rad], by the path of the stored
+        drive nearby, since a map is bent as a whole; None far from it."""
+        near = np.hypot(*(self.truth[:, :2] - truth[:2]).T) <= NEAR
+        if np.count_nonzero(near) < 5:
+            return None
+        pose = aligned(self.truth[near, :2], self.path[near, :2], np.ones(np.count_nonzero(near)))
+        return Pose2(*(float(v) for v in pose)) @ Pose2(*(float(v) for v in truth))
+
+    def save(self, file: Path) -> None:
+        """Write it for another run of a benchmark."""
+        content = np.frombuffer(self.stored.as_bytes(), np.uint8)
+        np.savez_compressed(file, stored=content, truth=self.truth, path=self.path)
+
+    @classmethod
+    def load(cls, name: str, file: Path) -> Reference:
+        """Read what `save` wrote."""
+        with np.load(file) as kept:
+            stored = StoredMap.of_bytes(kept["stored"].tobytes(), str(file))
+            return cls(name, stored, kept["truth"], kept["path"])
+
+
+def frame_offset(live: Drive, stored: Drive) -> Float:
+    """Return the constant shift x, y [m] of the stems of one drive from those of another at equal true poses,
+    shape (2,), from the frames alone: the common frame of recorded drives has an error of its own."""
+    found = []
+    for k in range(20, len(live.poses), max(len(live.poses) // 40, 1)):
+        d = np.hypot(*(stored.truth[:, :2] - live.truth[k, :2]).T)
+        j = int(np.argmin(d))
+        if d[j] > 4.0:
+            continue
+        there = np.concatenate([stored.seen(m) for m in range(max(j - 2, 0), min(j + 3, len(stored.poses)))])
+        here = live.seen(k)
+        pairs = cKDTree(there).query_ball_point(here, 2.5)
+        shift = np.concatenate([there[rows] - at for rows, at in zip(pairs, here, strict=True)])
+        tree = cKDTree(shift)
+        most = max(tree.query_ball_point(shift, 0.15), key=len)
+        found.append(shift[most].mean(axis=0))
+    shift_of_all: Float = np.median(found, axis=0)
+    return shift_of_all
+
+
+def recorded_drive(name: str, file: Path) -> Drive:
+    """Return a drive of Wild-Places or Oxford."""
+    recorded = read_recorded(file)
+    s = recorded.stems
+    order = np.argsort(s["frame"], kind="stable")
+    first = np.searchsorted(s["frame"][order], np.arange(len(recorded.poses) + 1))
+    xyz, axis, dbh = (np.asarray(s[key][order], np.float64) for key in ("xyz", "axis_z", "dbh"))
+    return Drive(name, recorded.stamp_ns, recorded.poses, first, (xyz, axis, dbh))
+
+
+def stand(seed: int, side: float, density: float, *, rows: bool = False) -> tuple[Float, Float]:
+    """Return positions, shape (N, 2) [m], and diameters, shape (N,) [m], of the stems of a square stand with
+    its corner at the origin: natural, at least 1 m apart, or planted in rows 3 m apart every 2 m."""
+    rng = np.random.default_rng([seed, 1])
+    if rows:
+        grid = np.stack(np.meshgrid(np.arange(0.0, side, 3.0), np.arange(0.0, side, 2.0)), axis=-1)
+        place = grid.reshape(-1, 2) + rng.normal(0.0, 0.15, (grid.size // 2, 2))
+        place = place[rng.random(len(place)) < 0.85]  # some were felled
+    else:
+        place = np.zeros((0, 2))
+        for at in rng.uniform(0.0, side, (int(1.3 * density * side**2), 2)):
+            if not len(place) or np.min(np.hypot(*(place - at).T)) >= 1.0:
+                place = np.vstack([place, at])
+    return place, rng.uniform(0.12, 0.5, len(place)) ** 1.2
+
+
+def stand_drive(name: str, place: Float, dbh: Float, way: Float, seed: int, *, felled: float = 0.0) -> Drive:
+    """Return a drive through a stand: a frame each 1.5 m, with 0.8 of the stems within 15 m, 0.05 m noise,
+    and 3 false stems.
+
+    Args:
+        name: For tables.
+        place, dbh: The stems, see `stand`.
+        way: Waypoints, shape (W, 2) [m].
+        seed: Of the noise.
+        felled: Share of the stems that are missing at this drive.
+    """
+    rng = np.random.default_rng([seed, 2])
+    there = rng.random(len(place)) >= felled
+    place, dbh = place[there], dbh[there]
+    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(way, axis=0).T)))
+    at = np.arange(0.0, length[-1], 1.5)
+    x, y = (np.interp(at, length, way[:, k]) for k in range(2))
+    yaw = np.unwrap(np.arctan2(np.gradient(y), np.gradient(x)))
+    poses = [Pose3.from_euler(np.array([a, b, 0.0]), 0.0, 0.0, c) for a, b, c in zip(x, y, yaw, strict=True)]
+    frames, first = [], [0]
+    for a, b, c in zip(x, y, yaw, strict=True):
+        seen = np.flatnonzero(
+            (np.hypot(place[:, 0] - a, place[:, 1] - b) < 15.0) & (rng.random(len(place)) < 0.8)
+        )
+        local = Pose2(float(a), float(b), float(c)).inverse().apply(place[seen])
+        local = np.vstack([local + rng.normal(0.0, 0.05, local.shape), rng.uniform(-15.0, 15.0, (3, 2))])
+        width = np.append(dbh[seen] + rng.normal(0.0, 0.015, len(seen)), rng.uniform(0.1, 0.5, 3))
+        width[rng.random(len(width)) < 0.5] = np.nan
+        frames.append((local, width))
+        first.append(first[-1] + len(local))
+    xy = np.concatenate([f[0] for f in frames])
+    axis = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
+    columns = (np.column_stack([xy, np.full(len(xy), 1.3)]), axis, np.concatenate([f[1] for f in frames]))
+    stamp = np.arange(len(poses), dtype=np.int64) * 1_500_000_000
+    return Drive(name, stamp, poses, np.array(first), columns)
+
+
+def sweep(side: float, lane: float) -> Float:
+    """Return waypoints up and down a stand, `lane` [m] apart, shape (W, 2) [m]."""
+    xs = np.arange(0.5 * lane, side, lane)
+    low, high = 8.0, side - 8.0
+    return np.array([p for k, x in enumerate(xs) for p in ([(x, low), (x, high)][:: 1 if k % 2 else -1])])
+
+
+def wander(side: float, length: float, rng: np.random.Generator) -> Float:
+    """Return waypoints of a random way of a length inside of a stand, shape (W, 2) [m]."""
+    at, yaw = rng.uniform(0.25 * side, 0.75 * side, 2), rng.uniform(-np.pi, np.pi)
+    way = [at]
+    for _ in range(int(length / 2.0)):
+        yaw += rng.normal(0.0, 0.12)
+        step = at + 2.0 * np.array([np.cos(yaw), np.sin(yaw)])
+        if not np.all((step > 6.0) & (step < side - 6.0)):
+            to = 0.5 * side - at
+            yaw += np.clip((np.arctan2(to[1], to[0]) - yaw + np.pi) % (2 * np.pi) - np.pi, -0.6, 0.6)
+            step = at + 2.0 * np.array([np.cos(yaw), np.sin(yaw)])
+        at = step
+        way.append(at)
+    return np.array(way)

@@ -1,0 +1,141 @@
+"""Starts without a pose in stored maps, and what came of them."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pipeline.geometry.poses import Float
+from pipeline.localisation import Localiser, State
+from tests.benchmarks.localise.drives import Drive, Reference
+
+WITHIN = 60.0  # m of driving
+LONGER = 20.0  # m, in which a fix is followed
+WRONG_XY, WRONG_YAW = 2.0, math.radians(5.0)
+
+
+@dataclass(slots=True, eq=False)
+class Start:
+    """Result of one start in one map.
+
+    Attributes:
+        is_there: Whether the stored drive passed all of the way.
+        found: Distance driven when it was found [m]; NaN if not.
+        wrong: Whether a wrong pose was called found at any time.
+        error_xy, error_yaw: Median errors while it was found [m, rad]; NaN if not found or unknown.
+        search_s: CPU times of the scans with a search [s].
+        state: State at the end.
+        withdrawn: Number of withdrawn fixes.
+        sigmas: Error of the position at the end in standard deviations.
+    """
+
+    is_there: bool
+    found: float = math.nan
+    wrong: bool = False
+    error_xy: float = math.nan
+    error_yaw: float = math.nan
+    search_s: list[float] = field(default_factory=list)
+    state: State = State.SEARCHING
+    withdrawn: int = 0
+    sigmas: float = math.nan
+
+
+def run_start(
+    drive: Drive,
+    begin: int,
+    seed: int,
+    references: Sequence[Reference],
+    offsets: Sequence[Float] | None = None,
+) -> list[Start]:
+    """Return the results of one start of a drive in some maps; the way is mapped once.
+
+    Args:
+        drive: The drive.
+        begin: Its first frame.
+        seed: Of odometry and mapper.
+        references: The stored maps.
+        offsets: Shift of the true poses of the drive in each map, see `frame_offset`; None for 0.
+    """
+    offsets = [np.zeros(2)] * len(references) if offsets is None else offsets
+    truth, driven = drive.truth, drive.driven
+    end = int(np.searchsorted(driven, driven[begin] + WITHIN + LONGER)) + 1
+    end = min(end, len(truth))
+    localisers = [Localiser(reference.stored) for reference in references]
+    starts = [Start(reference.covers(truth[begin:end, :2])) for reference in references]
+    errors: list[list[tuple[float, float]]] = [[] for _ in references]
+    for frame, stamp_ns, pose, trees in drive.mapped(begin, end, seed):
+        for reference, localiser, start, of, offset in zip(
+            references, localisers, starts, errors, offsets, strict=True
+        ):
+            searches, began = localiser.localisation.searches, time.thread_time()
+            got = localiser.update(stamp_ns, pose, trees)
+            if got.searches > searches:
+                start.search_s.append(time.thread_time() - began)
+            start.state, start.withdrawn = got.state, got.withdrawn
+            if got.T_map_odom is None:
+                continue
+            if math.isnan(start.found):
+                start.found = got.driven
+            there, is_at = reference.there(truth[frame] + np.append(offset, 0.0)), got.T_map_odom @ pose
+            if there is None:
+                start.wrong = start.wrong or not reference.covers(truth[frame : frame + 1, :2], 40.0)
+                continue
+            off = there.inverse() @ is_at
+            of.append((math.hypot(off.x, off.y), abs(off.yaw)))
+            start.wrong = start.wrong or of[-1][0] > WRONG_XY or of[-1][1] > WRONG_YAW
+            sigma = math.sqrt(0.5 * (got.covariance[0, 0] + got.covariance[1, 1]))
+            start.sigmas = of[-1][0] / max(sigma, 1e-6)
+    for start, of in zip(starts, errors, strict=True):
+        if of:
+            start.error_xy, start.error_yaw = (float(v) for v in np.median(of, axis=0))
+    return starts
+
+
+COLUMNS = (
+    "on the way",
+    "found within 60 m",
+    "[%]",
+    "wrong fixes",
+    "found after [m]",
+    "position [cm]",
+    "heading [deg]",
+    "error [sigma]",
+    "search [ms]",
+    "95 % [ms]",
+    "withdrawn",
+    "nothing is here",
+)
+
+
+def row_of(starts: Iterable[Start]) -> tuple[int | float, ...]:
+    """Return the cells of COLUMNS: starts on the way of the stored drive; of these found within WITHIN, and
+    in percent; wrong fixes of all starts; median distance to the fix; medians of position, heading, and
+    position in standard deviations; median and 95 % of the search; withdrawn fixes; starts that ended in
+    "nothing of this map is here"."""
+    starts = list(starts)
+    there = [s for s in starts if s.is_there]
+    found = [s for s in there if s.found <= WITHIN]
+    search = [t for s in starts for t in s.search_s] or [math.nan]
+
+    def middle(values: list[float]) -> float:
+        known = [v for v in values if not math.isnan(v)]
+        return float(np.median(known)) if known else math.nan
+
+    return (
+        len(there),
+        len(found),
+        100.0 * len(found) / max(len(there), 1),
+        sum(s.wrong for s in starts),
+        middle([s.found for s in found]),
+        100.0 * middle([s.error_xy for s in found]),
+        math.degrees(middle([s.error_yaw for s in found])),
+        middle([s.sigmas for s in found]),
+        1e3 * float(np.median(search)),
+        1e3 * float(np.quantile(search, 0.95)),
+        sum(s.withdrawn for s in starts),
+        sum(s.state is State.ABSENT for s in starts),
+    )

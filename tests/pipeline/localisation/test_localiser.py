@@ -1,0 +1,129 @@
+"""A robot is found in a stored map, never in the map of another place, and a wrong place is withdrawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.poses import Pose2, wrap_angle
+from pipeline.localisation import Localiser, State
+from tests.pipeline.localisation.stands import drive, planted, stand, stored, trees_at, way
+
+SIDE = 100.0
+
+
+def last(localiser, place, poses, seed):
+    """True T_map_odom and the localisation at the end of a drive."""
+    return list(drive(localiser, place, poses, seed))[-1]
+
+
+def errors(a: Pose2, b: Pose2) -> tuple[float, float]:
+    """Distance [m] and turn [rad] between two poses."""
+    off = a.inverse() @ b
+    return float(np.hypot(off.x, off.y)), abs(off.yaw)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_robot_is_found_and_followed(seed):
+    place = stand(seed)
+    true, got = last(Localiser(stored(place)), place, way(seed, SIDE), seed)
+    assert got.state is State.FOUND
+    assert got.found_at <= 60.0
+    assert got.stems >= 0.9 * got.of
+    assert got.withdrawn == 0
+    distance, turn = errors(true, got.T_map_odom)
+    assert distance < 0.3  # at the origin of odom, far from the stems
+    assert turn < 0.01
+    assert got.text.startswith(f"found: {got.stems} of {got.of} stems agree, 0.0")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_third_of_the_stems_may_be_gone(seed):
+    place = stand(seed)
+    kept = np.random.default_rng(seed).random(len(place)) > 1.0 / 3.0
+    true, got = last(Localiser(stored(place[kept])), place, way(seed, SIDE), seed)
+    assert got.state is State.FOUND
+    assert errors(true, got.T_map_odom)[0] < 0.4
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("kind", [stand, planted])
+def test_another_stand_is_never_found(kind, seed):
+    here, there = kind(seed), kind(seed + 100)
+    for _, got in drive(Localiser(stored(there)), here, way(seed, SIDE), seed):
+        assert got.state is not State.FOUND
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plantation_is_found_at_the_right_trees_or_not_at_all(seed):
+    place = planted(seed)
+    for true, got in drive(Localiser(stored(place)), place, way(seed, SIDE), seed):
+        if got.state is State.FOUND:
+            assert errors(true, got.T_map_odom)[0] < 0.5
+
+
+@pytest.mark.parametrize("motion", [Pose2(100.0, -50.0, 2.5), Pose2(0.0, 0.0, np.pi), Pose2(-7.0, 1e4, -0.4)])
+def test_a_moved_map_gives_the_moved_fix(motion):
+    place, poses = stand(1), way(1, SIDE, 30.0)
+    _, one = last(Localiser(stored(place)), place, poses, 1)
+    _, two = last(Localiser(stored(motion.apply(place))), place, poses, 1)
+    moved = motion @ one.T_map_odom
+    assert two.state is State.FOUND
+    assert (two.stems, two.of) == (one.stems, one.of)
+    assert np.hypot(moved.x - two.T_map_odom.x, moved.y - two.T_map_odom.y) < 1e-6
+    assert abs(wrap_angle(moved.yaw - two.T_map_odom.yaw)) < 1e-8
+
+
+def test_a_place_of_many_stems_outside_of_the_map_is_said_to_be_none_of_it():
+    here, there = stand(3, density=0.08), stand(4)
+    _, got = last(Localiser(stored(there)), here, way(3, SIDE), 3)
+    assert got.state is State.ABSENT
+    assert got.text == "nothing of this map is here"
+
+
+def test_few_stems_say_nothing():
+    _, got = last(
+        Localiser(stored(stand(1))), np.array([[0.0, 0.0], [2.0, 2.0], [4.0, 4.0]]), way(1, SIDE), 1
+    )
+    assert got.state is State.SEARCHING
+    assert got.text == "not found yet"
+
+
+def test_an_empty_map_is_never_found():
+    _, got = last(Localiser(stored(np.zeros((0, 2)))), stand(1), way(1, SIDE, 20.0), 1)
+    assert got.state is State.SEARCHING
+
+
+def test_stems_of_another_place_withdraw_a_fix():
+    """The robot is found, then carried to another forest without a word of its odometry."""
+    place, other = stand(1), stand(2, density=0.05)
+    localiser = Localiser(stored(place))
+    true, got = last(localiser, place, way(1, SIDE, 30.0), 1)
+    assert got.state is State.FOUND
+    pose = true.inverse() @ way(1, SIDE, 30.0)[-1]
+    for k in range(20):
+        pose = pose @ Pose2(1.0, 0.0, 0.0)
+        near = other[np.hypot(*(other - [pose.x + 50.0, pose.y + 50.0]).T) < 14.0] - 50.0
+        stamp = (100 + k) * 2_000_000_000
+        got = localiser.update(stamp, pose, trees_at(near, stamp))
+    assert got.state is not State.FOUND
+    assert got.withdrawn == 1
+    assert "contradicted" in got.text or got.state is State.ABSENT
+
+
+def test_outside_of_the_map_the_covariance_grows():
+    place = stand(1, side=60.0)
+    localiser = Localiser(stored(place))
+    poses = [Pose2(20.0 + 2.0 * k, 30.0, 0.0) for k in range(60)]
+    sigma = [np.sqrt(got.covariance[0, 0]) for _, got in drive(localiser, place, poses, 1)]
+    got = localiser.localisation
+    assert got.state is State.FOUND
+    assert got.of == 0
+    assert sigma[-1] > 3.0 * sigma[10] > 0.0
+
+
+def test_the_same_input_gives_the_same_fix():
+    place, poses = stand(5), way(5, SIDE, 30.0)
+    a, b = (last(Localiser(stored(place)), place, poses, 5)[1] for _ in range(2))
+    assert a.T_map_odom == b.T_map_odom
+    np.testing.assert_array_equal(a.covariance, b.covariance)
