@@ -84,9 +84,10 @@ def publish(frame: Frame, mapper: Mapper, live: LiveSource | None) -> None:
 
 def map_scans(arguments: argparse.Namespace, earlier: EarlierRun | None = None) -> int:
     """Map a run of scans and print the result; return the exit code. Arguments and errors as in `map_to`."""
+    outcome, replaces = map_to(arguments, earlier)
+
     from app.batch.map_run import WRONG
 
-    outcome, replaces = map_to(arguments, earlier)
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
     return print_result(
