@@ -9,10 +9,18 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.classification import ColumnClassifier, ColumnClassifierState, ForestOf, ScanView, package_alone
+from pipeline.classification import (
+    ColumnClassifier,
+    ColumnClassifierState,
+    ColumnVotes,
+    ForestOf,
+    ScanView,
+    package_alone,
+)
 from pipeline.classification.forest import is_seen_all_around
 from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
@@ -34,21 +42,36 @@ from pipeline.loop_closure.correction import (
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
 from pipeline.map_faults import MapFaults, reasons_of
 from pipeline.odometry.gyro import UNUSED, fused
-from pipeline.slam import FastSlam, Motion, SlamState
+from pipeline.slam import FastSlam, Loop, Motion, SlamState
 from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.measured_pose import REJECTED, within_gate
 from pipeline.slam.motion import noise_of, step_covariance
-from pipeline.slam.particle_ancestry import TrajectoryBuffer
+from pipeline.slam.particle_ancestry import EstimatedPath, TrajectoryBuffer
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
+from pipeline.tree_log import (
+    LoopSearch,
+    TreeCorrection,
+    TreeInput,
+    TreeLog,
+    TreesDifferError,
+    are_same,
+    lean,
+    lean_columns,
+)
 from pipeline.types.records import (
+    Columns,
+    Detections,
     Frame,
     HeightMap,
     Int,
+    Int32,
+    Landmarks,
     Path,
     PoseEstimate,
     Sensor,
     Step,
+    Trees,
     no_detections,
 )
 
@@ -90,6 +113,14 @@ class MapperState:
     last: tuple[Pose2, Float] | None = None
     delayed: PathCorrection | None = None
     faults: MapFaults = field(default_factory=MapFaults)
+
+
+class _Trees(NamedTuple):
+    """Tracks, number of the next new tree, and verdicts of the columns between two scans."""
+
+    tracks: TrackTable
+    next_number: int
+    verdict: Int32
 
 
 Correction = Restart[MapperState] | RelocalisedPose | LoopClosure | DoubledTrees | Smoothing | SearchFailure
@@ -142,6 +173,11 @@ class Mapper:
         self._last: tuple[Pose2, Float] | None = None
         self._delayed: PathCorrection | None = None
         self._faults = MapFaults()
+        #: Stores what each scan gives to the trees; None for no log.
+        self.log: TreeLog | None = None
+        self._inputs = _Inputs()
+        self._kept: dict[int, _Trees] = {}
+        self._verdict: Int32 = np.zeros(0, np.int32)
 
     def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
         """Map one scan: update path, trees, voxel columns and terrain, correct the map where a loop is closed
@@ -153,6 +189,7 @@ class Mapper:
                 time is used then. None segments the scan.
         """
         p, timer, stamp_ns = self._parameters, self._timer, step.scan.stamp_ns
+        self._inputs = inputs = _Inputs()
 
         # Sections 3.1 to 3.3: filters, ground, clusters, and a verdict for each cluster.
         scan = self.segment(step) if scan is None else scan
@@ -169,6 +206,7 @@ class Mapper:
             self._path.set_sigma(estimate.covariance)
 
         # Section 3.5: one Kalman filter per tree; the columns classify the trees. A lost robot maps nothing.
+        is_known, mapped_at = correction is None and not self._relocaliser.is_searching, estimate
         if self._relocaliser.is_searching:
             self._settle_columns()
         else:
@@ -183,6 +221,9 @@ class Mapper:
         self._last = (estimate.T_map_base, estimate.covariance)
         estimate, doubts = self._check_faults(step, scan, estimate)
         notices = (*notices, *doubts)
+        if self.log is not None:
+            given = inputs.of(stamp_ns, motion.step, mapped_at) if is_known else None
+            self.log.put(step.index, given)
         return self._frame(step, scan, found, estimate, notices, correction, closure)
 
     def segment(self, step: Step) -> SegmentedScan:
@@ -287,6 +328,60 @@ class Mapper:
         self._path = TrajectoryBuffer(stamp_ns, sigma_xy, motion)
         self.restore(state)
 
+    def repeat(self, known: TreeInput) -> Trees:
+        """Make the trees after a scan from its entry in the log of a mapper with other parameters of the
+        trees (`differ_in_trees_only`), and continue the path; return them. SLAM, columns and terrain stay as
+        they are: after the last scan, `restore` a state of that mapper `with_trees` of this one.
+
+        Args:
+            known: The entry of the next scan.
+
+        Raises:
+            TreesDifferError: These trees close another loop.
+        """
+        slam, tracker, path, stamp_ns = self._slam, self._tracker, self._path, known.stamp_ns
+        if known.keeps_state:
+            kept = (*self._kept.items(), (len(path), self._trees()))
+            self._kept = dict(kept[-2:])
+        path.append(stamp_ns, known.step)
+        path.set_sigma(known.estimate.covariance)
+        pose = known.estimate.T_map_base.as_array()
+        slam.state = replace(slam.state, path=slam.state.path.with_pose(pose))
+        if known.seen is not None:
+            tracker.process(stamp_ns, known.estimate, *known.seen)
+        if known.columns is not None:
+            p, columns = self._parameters.classification, known.columns
+            if known.votes is None:
+                tracker.classify_new(replace(columns, verdict=self._verdict))
+            else:
+                columns = replace(columns, verdict=known.votes.verdict(p.tree_share))
+                self._verdict = tracker.classify(stamp_ns, columns, p).verdict
+        if known.search is not None:
+            found = self._search_loop(known.search.history, is_due=known.search.is_due)
+            if not all(map(are_same, found, known.search.found)):
+                raise TreesDifferError
+        for each in known.corrections:
+            tracker.correct(each.correction, path.stamp_ns, each.estimate, each.landmarks, each.of_map)
+            slam.state = replace(slam.state, path=EstimatedPath.of(each.correction.after))
+        if self.log is not None:
+            self.log.put(len(path) - 1, known)
+        return tracker.trees()
+
+    @property
+    def verdict(self) -> Int32:
+        """Verdicts of the columns after `repeat`, int32, shape (C,)."""
+        return self._verdict
+
+    def with_trees(self, state: MapperState) -> MapperState:
+        """Return the state of another mapper after the scans that were given to `repeat`, with the trees of
+        this mapper in it and in the states that it keeps for a lost robot."""
+        kept = tuple((index, _with_trees(each, self._kept[index])) for index, each in state.recovery.kept)
+        return replace(_with_trees(state, self._trees()), recovery=replace(state.recovery, kept=kept))
+
+    def _trees(self) -> _Trees:
+        """Return a copy of the trees of `repeat`."""
+        return _Trees(self._tracker.tracks.copy(), self._tracker.next_number, self._verdict)
+
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Set the pose of the base before scan `index`: all particles are drawn from it, with the map and the
         path of the best one. The next scan has no motion by odometry, and loops do not begin before it. A
@@ -380,9 +475,11 @@ class Mapper:
         tracker, stamp_ns = self._tracker, step.scan.stamp_ns
         with self._timer("tracking"):
             if step.is_view and len(estimate.landmark_of) == len(found.detections.cluster):
-                tracker.process(stamp_ns, estimate, found.detections, self._slam.landmarks(), found.heights)
+                self._inputs.seen = (found.detections, self._slam.landmarks(), found.heights)
+                tracker.process(stamp_ns, estimate, *self._inputs.seen)
             # A scan that updates the columns classifies all tracks by them afterwards.
             if scan.column_input is None and self._parameters.classification.method == "columns":
+                self._inputs.columns = self._columns.columns
                 tracker.classify_new(self._columns.columns)
 
     def _update_columns(self, step: Step, scan: SegmentedScan, estimate: PoseEstimate) -> None:
@@ -399,6 +496,7 @@ class Mapper:
             path = np.zeros((0, 2)) if rings else self._slam.path()[:, :2]
             self._columns.all_around = is_seen_all_around(rings, path)
             self._columns.add(given.points, given.height, step.index, view)
+            self._inputs.columns, self._inputs.votes = self._columns.columns, self._columns.votes
             self._columns.columns = self._tracker.classify(
                 step.scan.stamp_ns, self._columns.columns, self._parameters.classification
             )
@@ -431,6 +529,7 @@ class Mapper:
             needs_state = relocaliser.needs_state(views, self._slam.is_supported)
             state = replace(self.snapshot(), recovery=RelocaliserState()) if needs_state else None
             relocaliser.remember(index, motion, views, state)
+            self._inputs.keeps_state = needs_state
 
     def _check_lost(
         self,
@@ -451,7 +550,7 @@ class Mapper:
         if p.relocalisation.method == "none":
             return None
         if relocaliser.is_searching:
-            run = self._history(estimate)
+            run = self._history(self._known_history(estimate))
             return relocaliser.search(index, motion, found.detections, scan.free, p, run)
         return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_lost else None
 
@@ -481,9 +580,9 @@ class Mapper:
             return None
         if p.method != "none" and len(self._path) > 1:
             with self._timer("slam"):
-                run = self._history(estimate)
-                loop = detection.find_loop(run, p) if self._is_search_due() else None
-                displaced = detection.find_displaced(run, p) if loop is None else None
+                is_due, known = self._is_search_due(), self._known_history(estimate)
+                loop, displaced = found = self._search_loop(known, is_due=is_due)
+                self._inputs.search = LoopSearch(known, is_due, found)
             if loop is not None:
                 return LoopClosure(loop)
             if displaced is not None:
@@ -499,13 +598,29 @@ class Mapper:
         recent = self._path.sigma_xy[slam.first_scan_within(detection.LATELY) :]
         return slam.is_keyframe_every(detection.EVERY) and detection.is_uncertain(recent)
 
-    def _history(self, estimate: PoseEstimate) -> detection.RunHistory:
-        """Return path and map for the search of loops, with the pose at the newest scan."""
-        return detection.RunHistory(
-            self._path.stamp_ns, self._slam.path(), self._tracker.trees(), self._slam.begun_since,
-            self._slam.best_pose, estimate, noise_of(self._parameters.slam), self._path.motion,
-            self._placed, self._closed, self._slam.state.places.contradicted,
+    def _known_history(self, estimate: PoseEstimate) -> Callable[..., detection.RunHistory]:
+        """Return `_history` without path and trees, as a function of them."""
+        return partial(
+            detection.RunHistory, begun_since=self._slam.begun_since, T_map_particle=self._slam.best_pose,
+            estimate=lean(estimate), noise=noise_of(self._parameters.slam), placed=self._placed,
+            closed=self._closed, contradicted=self._slam.state.places.contradicted,
         )  # fmt: skip
+
+    def _history(self, known: Callable[..., detection.RunHistory]) -> detection.RunHistory:
+        """Return path and map for the search of loops, with the pose at the newest scan."""
+        return known(
+            stamp_ns=self._path.stamp_ns, path=self._slam.path(), trees=self._tracker.trees(),
+            motion=self._path.motion,
+        )  # fmt: skip
+
+    def _search_loop(
+        self, known: Callable[..., detection.RunHistory], *, is_due: bool
+    ) -> tuple[Loop | None, Loop | None]:
+        """Return the loop by a constellation, which is searched for if it is due, and otherwise that by
+        doubled trees."""
+        run, p = self._history(known), self._parameters.relocalisation
+        loop = detection.find_loop(run, p) if is_due else None
+        return loop, detection.find_displaced(run, p) if loop is None else None
 
     def _apply(
         self, index: int, correction: Correction | None, estimate: PoseEstimate
@@ -577,6 +692,7 @@ class Mapper:
         estimate = self._slam.estimate(before)
         landmarks = self._slam.landmarks()
         of_map = self._slam.map_error(landmarks)
+        self._inputs.corrections += (TreeCorrection(correction, lean(estimate), landmarks, of_map),)
         self._tracker.correct(correction, self._path.stamp_ns, estimate, landmarks, of_map)
         self._delayed = correction if self._delayed is None else self._delayed.followed_by(correction)
         if self._delayed.largest(self.parameters.classification.range_max) >= CORRECTION_MIN:
@@ -643,3 +759,35 @@ class Mapper:
             base_z=base_z,
             clearance=scan.clearance,
         )
+
+
+@dataclass(slots=True)
+class _Inputs:
+    """What the present scan gives to the trees, see `TreeInput`."""
+
+    keeps_state: bool = False
+    seen: tuple[Detections, Landmarks, Float | None] | None = None
+    columns: Columns | None = None
+    votes: ColumnVotes | None = None
+    search: LoopSearch | None = None
+    corrections: tuple[TreeCorrection, ...] = ()
+
+    def of(self, stamp_ns: int, step: Pose2, estimate: PoseEstimate) -> TreeInput:
+        """Return the entry of the log."""
+        columns = None if self.columns is None else lean_columns(self.columns)
+        return TreeInput(
+            stamp_ns, step, lean(estimate), self.keeps_state, self.seen, columns, self.votes, self.search,
+            self.corrections,
+        )  # fmt: skip
+
+
+def _with_trees(state: MapperState, trees: _Trees) -> MapperState:
+    """Return a state with other trees; the arrays are shared."""
+    gathering = state.gathering
+    columns = replace(gathering.columns, verdict=trees.verdict)
+    return replace(
+        state,
+        tracks=trees.tracks,
+        next_number=trees.next_number,
+        gathering=replace(gathering, columns=columns),
+    )

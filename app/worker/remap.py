@@ -7,10 +7,10 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -30,10 +30,11 @@ from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.columns import columns_of, rows_in_common, rows_of
 from pipeline.io.block_file import BlockFile
-from pipeline.mapper import Mapper
+from pipeline.mapper import Mapper, MapperState
 from pipeline.remapping.preview import ClusterTable
-from pipeline.remapping.rerun import Rerun, Segment
+from pipeline.remapping.rerun import Rerun, Segment, TreeRerun
 from pipeline.seen_area import ViewSelection
+from pipeline.tree_log import TreeLog, differ_in_trees_only
 from pipeline.types.records import Columns, Float, Float32, Frame, Path, Step, Trees, Verdict
 from pipeline.types.units import SECOND_NS
 
@@ -73,6 +74,7 @@ class FrameStore:
         # Columns and ground of the last scan, and the scans that have them.
         self._objects: tuple[object, object] = (None, None)
         self._objects_in = (-1, -1)
+        self._read_last: dict[str, tuple[int, object]] = {}  # columns and ground, and the scan that has them
 
     def put(self, frame: Frame, path: Path, time_s: float, confirmed_s: Float) -> None:
         """Store the results of the scan after the last stored one; any other scan is ignored, also one that
@@ -120,18 +122,32 @@ class FrameStore:
     def read(self, index: int) -> Shown | None:
         """Return the results of a scan without points, with the path up to this scan and the run number 0;
         None if the results are not stored or are damaged."""
+        shown = self._shown(index)
+        path = None if shown is None else self._path_at(index)
+        return None if shown is None or path is None else msgspec.structs.replace(shown, path=path)
+
+    def frame(self, index: int) -> Frame | None:
+        """Return the frame of a scan without points; None as in `read`. Frames that are read in turn share
+        their columns and ground where these did not change."""
+        shown = self._shown(index)
+        return None if shown is None else shown.frame
+
+    def _shown(self, index: int) -> Shown | None:
+        """Return what `read` returns, without the path."""
         scan = self._read(index)
-        path = None if scan is None else self._path_at(index)
-        if scan is None or path is None:
+        if scan is None:
             return None
-        frame = scan.shown.frame
+        objects: dict[str, Any] = {}
         for name, number in (("columns", scan.columns_in), ("ground", scan.ground_in)):
-            if number not in (-1, index):
-                earlier = self._read(number)
-                if earlier is None:
+            if number == -1:
+                continue
+            if self._read_last.get(name, (-1,))[0] != number:
+                holder = scan if number == index else self._read(number)
+                if holder is None:
                     return None
-                frame = replace(frame, **{name: getattr(earlier.shown.frame, name)})
-        return msgspec.structs.replace(scan.shown, frame=frame, path=path)
+                self._read_last[name] = number, getattr(holder.shown.frame, name)
+            objects[name] = self._read_last[name][1]
+        return msgspec.structs.replace(scan.shown, frame=replace(scan.shown.frame, **objects))
 
     def forget_from(self, index: int) -> None:
         """Remove the results of the scan with this index and of later ones."""
@@ -139,6 +155,7 @@ class FrameStore:
             self._path, self._objects = self._path_at(index - 1), (None, None)
             self._scans = index
         self._blocks.forget_from(index)
+        self._read_last.clear()
         self._corrections = [(scan, row) for scan, row in self._corrections if scan < index]
 
     def close(self) -> None:
@@ -204,6 +221,7 @@ class RunMap:
     ) -> None:
         self.mapper = mapper
         self.frames = None if is_live else FrameStore()
+        mapper.log = None if is_live else TreeLog()
         self.parameters = ParameterHistory(parameters)
         self.before = mapper.snapshot()
         self.snapshots = Snapshots(self.before, 0 if is_live else _MOST_STATES)
@@ -254,6 +272,15 @@ class RunMap:
         last = self.history.last_places()
         return {n: last[n] for n in self.confirmed_s.keys() - set(trees.number.tolist()) if n in last}
 
+    def tree_rerun(self, mapper: Mapper) -> TreeRerun | None:
+        """Return the rerun of the trees of this map by a new mapper; None if other parameters differ as well,
+        or a scan is not known."""
+        log, frames = self.mapper.log, self.frames
+        alike = all(differ_in_trees_only(each, mapper.parameters) for each in self.parameters.sets)
+        if not alike or log is None or frames is None or not log.has_all(self.before.path_length):
+            return None
+        return TreeRerun(mapper, log, frames.frame, self.snapshots.at, dict(self.views))
+
     def use(self, parameters: Parameters, index: int) -> bool:
         """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
         value changes. If so, the states after that scan are dropped, the frames and the course of this scan
@@ -294,7 +321,9 @@ class Remapping:
         preview: Computes the preview in steps.
     """
 
-    def __init__(self, rerun: Rerun, new_map: RunMap, preview: Generator[None, None, None]) -> None:
+    def __init__(
+        self, rerun: Rerun | TreeRerun, new_map: RunMap, preview: Generator[None, None, None]
+    ) -> None:
         self.rerun, self.map, self._preview = rerun, new_map, preview
 
     def map_next(self, until: int) -> bool:
@@ -312,15 +341,16 @@ class Remapping:
             rerun.go_back(*snapshots.newest(until))
         if rerun.done < until:
             if snapshots.is_due(rerun.done):
-                snapshots.offer(rerun.done, rerun.mapper.snapshot())
+                state = rerun.state()
+                if state is not None:
+                    snapshots.offer(rerun.done, state)
             self.map.add(rerun.map_next(), rerun.free, {})
         return rerun.done == until
 
-    def finish(self) -> RunMap:
+    def finish(self, before: MapperState) -> RunMap:
         """End the rerun and return the new map, whose `before` is then the state after the last scan that the
-        rerun mapped."""
-        self.rerun.close()
-        self.map.before = self.rerun.mapper.snapshot()
+        rerun mapped. The argument is that state of the present map."""
+        self.map.before = self.rerun.finish(before)
         return self.map
 
     def close(self) -> None:
@@ -421,10 +451,15 @@ class Snapshots(Generic[S]):
         """Return the newest state with at most this number of scans (0 or more), as (number of scans, state).
         A stored state that cannot be read is skipped; 0 and the first state are left."""
         for n in sorted((n for n in self._files if n <= scans), reverse=True):
-            state = self._files[n].read_block(0, self._codec.decode)
+            state = self.at(n)
             if state is not None:
                 return n, state
         return 0, self._start
+
+    def at(self, scans: int) -> S | None:
+        """Return the state with exactly this number of scans; None if it is not stored or cannot be read."""
+        file = self._files.get(scans)
+        return None if file is None else file.read_block(0, self._codec.decode)
 
     def forget_after(self, scans: int) -> None:
         """Drop the states that contain more than this number of scans."""
@@ -446,6 +481,11 @@ class ParameterHistory:
     def __init__(self, parameters: Parameters) -> None:
         self._starts = [0]
         self._sets = [parameters]
+
+    @property
+    def sets(self) -> Sequence[Parameters]:
+        """All sets, in the order of their scans."""
+        return self._sets
 
     def at(self, index: int) -> Parameters:
         """Return the parameters with which the scan with this index (0 or more) was or will be mapped."""

@@ -39,6 +39,7 @@ from pipeline.odometry.synchroniser import steps
 from pipeline.remapping.preview import KnownMap, needs_sample, preview_trees, sample_scans
 from pipeline.remapping.rerun import Rerun, ScanCaches
 from pipeline.slam.keyframe_graph import KeyframeGraph
+from pipeline.tree_log import TreesDifferError
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
 #: Returns a mapper of a source for parameters and a seed, see `mapper_of`.
@@ -329,16 +330,22 @@ class Run:
         previous, self._previous = self._previous, None
         if previous is not None and previous.rewind_if_same(parameters):
             done = previous.before.path_length
-            rerun = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
+            rest = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
             no_preview: Generator[None, None, None] = (None for _ in ())  # only the current scan is left
-            self._remapping = Remapping(rerun, previous, no_preview)
+            self._remapping = Remapping(rest, previous, no_preview)
             return
         if previous is not None:
             previous.close()
         mapper = self._make_mapper(parameters)
-        rerun = Rerun(mapper, cache, reread, segment_ahead)
-        preview = self._preview_steps(parameters, mapper, on_preview)
-        self._remapping = Remapping(rerun, self._new_map(mapper), preview)
+        new_map = self._new_map(mapper)
+        rerun = self._map.tree_rerun(mapper) or Rerun(mapper, cache, reread, segment_ahead)
+        self._remapping = Remapping(rerun, new_map, self._preview_steps(parameters, mapper, on_preview))
+
+    def _whole_remapping(self, parameters: Parameters) -> Remapping:
+        """Return a rerun of all scans without preview."""
+        mapper, no_preview = self._make_mapper(parameters), (None for _ in ())
+        reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
+        return Remapping(Rerun(mapper, cache, reread, segment_ahead), self._new_map(mapper), no_preview)
 
     def _preview_steps(
         self, parameters: Parameters, mapper: Mapper, on_preview: Callable[[Trees], None]
@@ -408,13 +415,18 @@ class Run:
         try:
             with self.stopwatch.aside():
                 finished = remapping.map_next(self.current)
+                new_map = remapping.finish(self._map.before) if finished else None
+        except TreesDifferError:  # the whole run must be mapped again, and its preview is known
+            self._remapping = self._whole_remapping(remapping.rerun.mapper.parameters)
+            remapping.close()
+            return None
         except BaseException:  # also a fault of the mapper, which another try would repeat
             self.cancel_remapping()
             raise
-        if not finished:
+        if new_map is None:
             return None
         self._previous = self._map
-        self._remapping, self._map, self._views_sent = None, remapping.finish(), 0
+        self._remapping, self._map, self._views_sent = None, new_map, 0
         self._cache = self._caches.of(self._map.parameters.at(self.current))
         frame = self._map_step(self._step, new_map=True)
         confirmed_s = {self._numbers.known(n): at for n, at in self._map.confirmed_s.items()}

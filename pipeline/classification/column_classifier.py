@@ -220,6 +220,10 @@ class ColumnClassifier:
         all_around: Initial value of the attribute `all_around`.
         forests: Function of the name of a random forest and `all_around` that returns the forest.
 
+    Attributes:
+        columns: The columns.
+        votes: What decided their verdicts at the last scan that was added.
+
     Raises:
         StemmapError: There is no such forest.
     """
@@ -232,6 +236,7 @@ class ColumnClassifier:
         self._memory: VoxelMap | None = VoxelMap.empty(1 << parameters.voxels_log2)
         self._folded: Callable[[], VoxelMap] | None = None  # makes the voxel map on demand after `restore`
         self.columns = no_columns()
+        self.votes = column_votes(self.columns)
         self._base = PackedVoxelMap.of(self.memory)
         self._since: list[tuple[Float32, int, int]] = []
 
@@ -380,7 +385,8 @@ class ColumnClassifier:
         if self._vote_again:
             first, self._vote_again = 0, False
         c.share[first:] = vote(c.figures[first:], self._forest)
-        self.columns = replace(c, verdict=column_votes(c).verdict(self.parameters.tree_share))
+        self.votes = column_votes(c)
+        self.columns = replace(c, verdict=self.votes.verdict(self.parameters.tree_share))
 
 
 def no_columns() -> Columns:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
@@ -445,15 +447,14 @@ class FastSlam:
             score=known.score[rows],
         )
 
-    def begun_since(self, scan: int) -> tuple[Float, Float]:
-        """Return the landmarks of the best particle that were begun at a scan or later and have at least
-        `hits_to_weigh` hits: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]. The
-        scan of a landmark is that of its reference pose, which may be a little earlier than the scan that
-        began it."""
-        known = self._best_map(self.state)
-        young = self.state.frame.scan_of(known.birth) >= scan
-        rows = young & (known.hits >= self.parameters.hits_to_weigh)
-        return known.mean[rows], known.covariance[rows]
+    @property
+    def begun_since(self) -> Callable[[int], tuple[Float, Float]]:
+        """Function of a scan number that returns the landmarks of the best particle, as it is now, that were
+        begun at this scan or later and have at least `hits_to_weigh` hits: positions, shape (L, 2) [m], and
+        covariances xx, xy, yy, shape (L, 3) [m^2]. The scan of a landmark is that of its reference pose,
+        which may be a little earlier than the scan that began it."""
+        known, frame = self._best_map(self.state), self.state.frame
+        return partial(_begun_since, known, frame, self.parameters.hits_to_weigh)
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
         """Return the state after one more odometry step: the motion since the last used scan, its covariance
@@ -677,6 +678,13 @@ class FastSlam:
             now, _, _ = _estimate(moved, self._best_map(moved), weights, self.parameters, 0.0)
             shared = SharedErrors.begun_at(len(state.pose), now.T_map_base.as_array(), now.covariance)
         return shared.measured(measured)
+
+
+def _begun_since(known: MapColumns, frame: FrameUncertainty, hits: int, scan: int) -> tuple[Float, Float]:
+    """Return positions and covariances of the landmarks with at least `hits` hits that were begun at a scan
+    or later."""
+    rows = (frame.scan_of(known.birth) >= scan) & (known.hits >= hits)
+    return known.mean[rows], known.covariance[rows]
 
 
 def _at_scans(covariance: Float, graph: KeyframeGraph, scans: Int) -> Float:

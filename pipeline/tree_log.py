@@ -1,0 +1,157 @@
+"""What the trees of a run are made of: for each scan, what SLAM and the voxel columns gave to the tracks.
+
+Poses, landmarks and columns do not depend on the parameters of the tracks and on the share of votes of a
+tree. After a change of one of these, the trees are made again from this log, without SLAM and without
+columns; see `Mapper.repeat`. Trees act on poses only by the search of loops, which is therefore repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.classification import ColumnVotes
+from pipeline.config import Parameters
+from pipeline.geometry.pose_arrays import PathCorrection
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.loop_closure.detection import RunHistory
+from pipeline.slam import Loop
+from pipeline.types.records import Columns, Detections, Landmarks, PoseEstimate
+
+MOST_BYTES = 256 << 20  # of one log; ten minutes of a dense forest take about 100 MB
+SCAN_BYTES, LANDMARK_BYTES = 6000, 56  # of a scan with 25 detections without landmarks, and of a landmark
+#: Parameters, by stage, that act on the trees only.
+OF_TREES = {"tracking": None, "classification": {"tree_share"}, "evaluation": None, "obstacles": None}
+
+
+class TreesDifferError(Exception):
+    """The trees cannot be made again from the log: a scan is not in it, or other trees close other loops."""
+
+
+class LoopSearch(NamedTuple):
+    """A search of loops, and its result.
+
+    Attributes:
+        history: Function of `stamp_ns`, `path`, `trees` and `motion` that returns the history for the search.
+        is_due: Whether loops by constellations were searched for.
+        found: The loop by a constellation and that by doubled trees; None for none.
+    """
+
+    history: Callable[..., RunHistory]
+    is_due: bool
+    found: tuple[Loop | None, Loop | None]
+
+
+class TreeCorrection(NamedTuple):
+    """A correction of the map, see `Tracker.correct`."""
+
+    correction: PathCorrection
+    estimate: PoseEstimate
+    landmarks: Landmarks
+    of_map: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TreeInput:
+    """What a scan gave to the trees, in the order in which it is used.
+
+    Attributes:
+        stamp_ns: Time of the scan [ns].
+        step: Motion from the scan before by odometry.
+        estimate: Pose, without particles.
+        keeps_state: Whether the relocaliser stored the state before the scan.
+        seen: Detections, landmarks and heights of the detections; None if the scan updates no tracks.
+        columns: Axes and votes of the columns, its other arrays are empty; None without columns.
+        votes: What decides the verdicts of the columns; None for a scan that does not update them.
+        search: The search of loops; None at a scan without it.
+        corrections: Corrections after it.
+    """
+
+    stamp_ns: int
+    step: Pose2
+    estimate: PoseEstimate
+    keeps_state: bool
+    seen: tuple[Detections, Landmarks, Float | None] | None
+    columns: Columns | None
+    votes: ColumnVotes | None
+    search: LoopSearch | None
+    corrections: tuple[TreeCorrection, ...]
+
+
+class TreeLog:
+    """What each scan of a run gave to its trees. A log of more than MOST_BYTES is empty from then on."""
+
+    def __init__(self) -> None:
+        self._scans: list[TreeInput | None] = []
+        self._nbytes = 0
+
+    def put(self, index: int, known: TreeInput | None) -> None:
+        """Store the input of a scan, in place of an earlier one; None if the trees cannot be made from it."""
+        self._nbytes += 0 if known is None else self._size(known)
+        if self._nbytes > MOST_BYTES:
+            self._scans.clear()
+        elif index < len(self._scans):
+            self._scans[index] = known
+        elif index == len(self._scans):
+            self._scans.append(known)
+
+    def at(self, index: int) -> TreeInput:
+        """Return the input of a scan; TreesDifferError if it is not known."""
+        known = self._scans[index] if index < len(self._scans) else None
+        if known is None:
+            raise TreesDifferError
+        return known
+
+    def has_all(self, scans: int) -> bool:
+        """Return whether the inputs of the first scans are known."""
+        return len(self._scans) >= scans and None not in self._scans[:scans]
+
+    def _size(self, known: TreeInput) -> int:
+        """Return the approximate memory that an input takes [bytes]: landmarks and columns are shared by the
+        scans that do not change them."""
+        size = SCAN_BYTES + sum(2 * each.correction.after.nbytes for each in known.corrections)
+        if known.votes is not None and known.columns is not None:
+            size += known.votes.nbytes + known.columns.axis.nbytes
+        last = self._scans[-1] if self._scans else None
+        if known.seen is not None and (
+            last is None or last.seen is None or last.seen[1].birth is not known.seen[1].birth
+        ):
+            size += LANDMARK_BYTES * len(known.seen[1].birth)
+        return size
+
+
+def lean(estimate: PoseEstimate) -> PoseEstimate:
+    """Return an estimate without particles, weights and landmarks."""
+    nothing = np.zeros(0)
+    return replace(estimate, particles=nothing, weights=nothing, landmarks=nothing)
+
+
+def lean_columns(columns: Columns) -> Columns:
+    """Return columns with axes and votes only; the other arrays are empty."""
+    names = [f.name for f in fields(columns) if f.name not in ("axis", "share")]
+    return replace(columns, **{name: getattr(columns, name)[:0].copy() for name in names})
+
+
+def are_same(a: Loop | None, b: Loop | None) -> bool:
+    """Return whether two loops are equal, bit by bit."""
+    if a is None or b is None:
+        return a is b
+    same = (a.first, a.anchor, a.T_map_base) == (b.first, b.anchor, b.T_map_base)
+    return same and np.array_equal(a.covariance, b.covariance)
+
+
+def differ_in_trees_only(a: Parameters, b: Parameters) -> bool:
+    """Return whether two sets of parameters differ at most in those that act on the trees only."""
+    breast = a.tracking.breast_height == b.tracking.breast_height  # centres of clusters refer to it
+    return breast and _without_trees(a) == _without_trees(b)
+
+
+def _without_trees(p: Parameters) -> dict[str, object]:
+    values = p.model_dump()
+    for stage, names in OF_TREES.items():
+        for name in list(values[stage]) if names is None else names:
+            del values[stage][name]
+    return values
