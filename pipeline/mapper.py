@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
@@ -331,7 +331,7 @@ class Mapper:
     def repeat(self, known: TreeInput) -> Trees:
         """Make the trees after a scan from its entry in the log of a mapper with other parameters of the
         trees (`differ_in_trees_only`), and continue the path; return them. SLAM, columns and terrain stay as
-        they are: after the last scan, `restore` a state of that mapper `with_trees` of this one.
+        they are: after the last scan, `restore` a state of that mapper `with_trees`.
 
         Args:
             known: The entry of the next scan.
@@ -372,11 +372,11 @@ class Mapper:
         """Verdicts of the columns after `repeat`, int32, shape (C,)."""
         return self._verdict
 
-    def with_trees(self, state: MapperState) -> MapperState:
-        """Return the state of another mapper after the scans that were given to `repeat`, with the trees of
-        this mapper in it and in the states that it keeps for a lost robot."""
-        kept = tuple((index, _with_trees(each, self._kept[index])) for index, each in state.recovery.kept)
-        return replace(_with_trees(state, self._trees()), recovery=replace(state.recovery, kept=kept))
+    def with_trees(self) -> Callable[[MapperState], MapperState]:
+        """Return a function of the state of another mapper after the scans that were given to `repeat`. It
+        returns the state with the present trees of this mapper, also in the states that are kept for a lost
+        robot."""
+        return partial(_with_all_trees, self._trees(), self._kept)
 
     def _trees(self) -> _Trees:
         """Return a copy of the trees of `repeat`."""
@@ -779,6 +779,13 @@ class _Inputs:
             stamp_ns, step, lean(estimate), self.keeps_state, self.seen, columns, self.votes, self.search,
             self.corrections,
         )  # fmt: skip
+
+
+def _with_all_trees(trees: _Trees, kept: Mapping[int, _Trees], state: MapperState) -> MapperState:
+    """Return a state with other trees, and with those in `kept` in the states that it keeps, by their
+    scans."""
+    states = tuple((index, _with_trees(each, kept[index])) for index, each in state.recovery.kept)
+    return replace(_with_trees(state, trees), recovery=replace(state.recovery, kept=states))
 
 
 def _with_trees(state: MapperState, trees: _Trees) -> MapperState:

@@ -30,7 +30,7 @@ from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.columns import columns_of, rows_in_common, rows_of
 from pipeline.io.block_file import BlockFile
-from pipeline.mapper import Mapper, MapperState
+from pipeline.mapper import Mapper
 from pipeline.remapping.preview import ClusterTable
 from pipeline.remapping.rerun import Rerun, Segment, TreeRerun
 from pipeline.seen_area import ViewSelection
@@ -279,7 +279,7 @@ class RunMap:
         alike = all(differ_in_trees_only(each, mapper.parameters) for each in self.parameters.sets)
         if not alike or log is None or frames is None or not log.has_all(self.before.path_length):
             return None
-        return TreeRerun(mapper, log, frames.frame, self.snapshots.at, dict(self.views))
+        return TreeRerun(mapper, log, frames.frame, dict(self.views))
 
     def use(self, parameters: Parameters, index: int) -> bool:
         """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
@@ -317,14 +317,19 @@ class Remapping:
 
     Args:
         rerun: The rerun, with the mapper of the new map.
+        known: The present map.
         new_map: The new map, after the scans that the rerun has done.
         preview: Computes the preview in steps.
     """
 
     def __init__(
-        self, rerun: Rerun | TreeRerun, new_map: RunMap, preview: Generator[None, None, None]
+        self,
+        rerun: Rerun | TreeRerun,
+        known: RunMap,
+        new_map: RunMap,
+        preview: Generator[None, None, None],
     ) -> None:
-        self.rerun, self.map, self._preview = rerun, new_map, preview
+        self.rerun, self._known, self.map, self._preview = rerun, known, new_map, preview
 
     def map_next(self, until: int) -> bool:
         """Take the next step of the preview and return False; if the preview is complete, map the next scan
@@ -341,16 +346,17 @@ class Remapping:
             rerun.go_back(*snapshots.newest(until))
         if rerun.done < until:
             if snapshots.is_due(rerun.done):
-                state = rerun.state()
-                if state is not None:
-                    snapshots.offer(rerun.done, state)
+                if isinstance(rerun, TreeRerun):
+                    snapshots.share(rerun.done, self._known.snapshots, rerun.mapper.with_trees())
+                else:
+                    snapshots.offer(rerun.done, rerun.mapper.snapshot())
             self.map.add(rerun.map_next(), rerun.free, {})
         return rerun.done == until
 
-    def finish(self, before: MapperState) -> RunMap:
+    def finish(self) -> RunMap:
         """End the rerun and return the new map, whose `before` is then the state after the last scan that the
-        rerun mapped. The argument is that state of the present map."""
-        self.map.before = self.rerun.finish(before)
+        rerun mapped."""
+        self.map.before = self.rerun.finish(self._known.before)
         return self.map
 
     def close(self) -> None:
@@ -404,7 +410,7 @@ _MOST_STATES = 20
 
 class Snapshots(Generic[S]):
     """States of the mapper by the number of scans they contain (0: before the first scan), in temporary
-    files.
+    files, which two collections can share.
 
     Beyond the maximum number of states, every second one is dropped and the spacing doubles. The first state
     is in memory. A state that cannot be written is not stored.
@@ -417,7 +423,8 @@ class Snapshots(Generic[S]):
     def __init__(self, start: S, most: int = _MOST_STATES) -> None:
         self._start, self._most = start, most
         self._codec: MessageCodec[S] = MessageCodec(type(start))
-        self._files: dict[int, BlockFile] = {}
+        # The file of each state, and what changes the state that is read from it.
+        self._files: dict[int, tuple[BlockFile, Callable[[S], S] | None]] = {}
         self._spacing = _SPACING
 
     def offer(self, scans: int, state: S) -> None:
@@ -431,13 +438,25 @@ class Snapshots(Generic[S]):
         """
         if not self.is_due(scans):
             return
-        self._files[scans] = file = BlockFile()
+        file = BlockFile()
+        self._files[scans] = file, None
         try:
             is_stored = file.put_block(0, self._codec.encode(state)[LENGTH_BYTES:])
         except WireError:  # it is too large
             is_stored = False
         if not is_stored:
             self._keep(lambda n: n != scans)
+        self._thin_out()
+
+    def share(self, scans: int, other: Snapshots[S], change: Callable[[S], S]) -> None:
+        """Store the state of another collection with a change, if it is stored there; the file is shared, and
+        `change` applies when the state is read, in place of a change there."""
+        if scans in other._files and self.is_due(scans):
+            self._files[scans] = other._files[scans][0], change
+            self._thin_out()
+
+    def _thin_out(self) -> None:
+        """Double the spacing if there are too many states, and drop those at other numbers of scans."""
         if len(self._files) > self._most:
             self._spacing *= 2
             self._keep(lambda n: n % self._spacing == 0)
@@ -458,8 +477,9 @@ class Snapshots(Generic[S]):
 
     def at(self, scans: int) -> S | None:
         """Return the state with exactly this number of scans; None if it is not stored or cannot be read."""
-        file = self._files.get(scans)
-        return None if file is None else file.read_block(0, self._codec.decode)
+        file, change = self._files.get(scans, (None, None))
+        state = None if file is None else file.read_block(0, self._codec.decode)
+        return state if state is None or change is None else change(state)
 
     def forget_after(self, scans: int) -> None:
         """Drop the states that contain more than this number of scans."""
@@ -470,9 +490,10 @@ class Snapshots(Generic[S]):
         self._keep(lambda _: False)
 
     def _keep(self, which: Callable[[int], bool]) -> None:
-        """Drop the states for whose number of scans `which` is False."""
+        """Drop the states for whose number of scans `which` is False. A file is closed when no collection has
+        it any more."""
         for scans in [n for n in self._files if not which(n)]:
-            self._files.pop(scans).close()
+            del self._files[scans]
 
 
 class ParameterHistory:

@@ -332,20 +332,22 @@ class Run:
             done = previous.before.path_length
             rest = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
             no_preview: Generator[None, None, None] = (None for _ in ())  # only the current scan is left
-            self._remapping = Remapping(rest, previous, no_preview)
+            self._remapping = Remapping(rest, self._map, previous, no_preview)
             return
         if previous is not None:
             previous.close()
         mapper = self._make_mapper(parameters)
         new_map = self._new_map(mapper)
         rerun = self._map.tree_rerun(mapper) or Rerun(mapper, cache, reread, segment_ahead)
-        self._remapping = Remapping(rerun, new_map, self._preview_steps(parameters, mapper, on_preview))
+        preview = self._preview_steps(parameters, mapper, on_preview)
+        self._remapping = Remapping(rerun, self._map, new_map, preview)
 
     def _whole_remapping(self, parameters: Parameters) -> Remapping:
         """Return a rerun of all scans without preview."""
         mapper, no_preview = self._make_mapper(parameters), (None for _ in ())
         reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
-        return Remapping(Rerun(mapper, cache, reread, segment_ahead), self._new_map(mapper), no_preview)
+        rerun = Rerun(mapper, cache, reread, segment_ahead)
+        return Remapping(rerun, self._map, self._new_map(mapper), no_preview)
 
     def _preview_steps(
         self, parameters: Parameters, mapper: Mapper, on_preview: Callable[[Trees], None]
@@ -415,7 +417,7 @@ class Run:
         try:
             with self.stopwatch.aside():
                 finished = remapping.map_next(self.current)
-                new_map = remapping.finish(self._map.before) if finished else None
+                new_map = remapping.finish() if finished else None
         except TreesDifferError:  # the whole run must be mapped again, and its preview is known
             self._remapping = self._whole_remapping(remapping.rerun.mapper.parameters)
             remapping.close()

@@ -219,10 +219,6 @@ class Rerun:
         self.mapper.restore(state)
         self.done, self._segmented = scans, None
 
-    def state(self) -> MapperState | None:
-        """Return the state after the scans that are mapped."""
-        return self.mapper.snapshot()
-
     def finish(self, _last: MapperState) -> MapperState:
         """Close the rerun, and return the state of the mapper. The argument is not used."""
         self.close()
@@ -261,7 +257,6 @@ class TreeRerun:
         mapper: A mapper with the new parameters, before its first scan.
         log: Log of the known map, which may grow.
         frame_of: Returns the frame of a scan in the known map; None if it is not stored.
-        state_of: Returns the state of the known map after so many scans; None if it is not stored.
         free_of: Free ranges by the time of the scan [ns], where they are known.
     """
 
@@ -270,13 +265,12 @@ class TreeRerun:
         mapper: Mapper,
         log: TreeLog,
         frame_of: Callable[[int], Frame | None],
-        state_of: Callable[[int], MapperState | None],
         free_of: Mapping[int, Float],
     ) -> None:
         self.mapper = mapper
         self.done = 0
         self.free: Float = np.zeros(0)
-        self._log, self._frame_of, self._state_of, self._free_of = log, frame_of, state_of, free_of
+        self._log, self._frame_of, self._free_of = log, frame_of, free_of
         self._known: Columns | None = None
         self._columns: Columns | None = None  # the same with the new verdicts
 
@@ -303,17 +297,12 @@ class TreeRerun:
         """Raise TreesDifferError: a rerun of the trees only goes on."""
         raise TreesDifferError
 
-    def state(self) -> MapperState | None:
-        """Return the state after the scans that are mapped; None if that of the known map is not stored."""
-        state = self._state_of(self.done)
-        return None if state is None else self.mapper.with_trees(state)
-
     def finish(self, last: MapperState) -> MapperState:
         """Restore the last state of the known map with the new trees, and return it; TreesDifferError if it
         is not the state after the scans that are mapped."""
         if last.path_length != self.done:
             raise TreesDifferError
-        self.mapper.restore(self.mapper.with_trees(last))
+        self.mapper.restore(self.mapper.with_trees()(last))
         return self.mapper.snapshot()
 
     def close(self) -> None:

@@ -38,7 +38,7 @@ def test_a_damaged_state_is_passed_over() -> None:
     with closing(Snapshots(0)) as kept:
         for scans in range(101):
             kept.offer(scans, scans)
-        file = kept._files[100]
+        file, _ = kept._files[100]
         assert file._file is not None
         file._file.seek(0)
         file._file.write(b"damaged")
@@ -49,8 +49,8 @@ def test_a_state_of_other_contents_is_passed_over() -> None:
     with closing(Snapshots(0)) as kept:
         for scans in range(101):
             kept.offer(scans, scans)
-        kept._files[100].close()
-        kept._files[100] = other = BlockFile()
+        other = BlockFile()
+        kept._files[100] = other, None
         assert other.put_block(0, b"no state")
         assert kept.newest(100) == (50, 50)
 
@@ -58,6 +58,19 @@ def test_a_state_of_other_contents_is_passed_over() -> None:
 def test_a_run_that_cannot_go_back_stores_no_state() -> None:
     kept: Snapshots[int] = Snapshots(0, 0)
     assert not any(kept.is_due(scans) for scans in range(1000))
+
+
+def test_two_collections_share_a_state_and_either_may_drop_it() -> None:
+    first, second, third = Snapshots(0), Snapshots(0), Snapshots(0)
+    for scans in range(101):
+        first.offer(scans, scans)
+    second.share(100, first, lambda state: state + 1)
+    second.share(150, first, lambda state: state + 1)  # not stored in the first
+    third.share(100, second, lambda state: state + 2)
+    first.close()
+    assert (second.newest(200), third.newest(200)) == ((100, 101), (100, 102))
+    second.close()
+    assert (second.newest(200), third.newest(200)) == ((0, 0), (100, 102))
 
 
 @given(st.integers(0, 500), st.integers(0, 500))
