@@ -57,7 +57,6 @@ from pipeline.tree_log import (
     TreesDifferError,
     are_same,
     lean,
-    lean_columns,
 )
 from pipeline.types.records import (
     Columns,
@@ -222,7 +221,7 @@ class Mapper:
         estimate, doubts = self._check_faults(step, scan, estimate)
         notices = (*notices, *doubts)
         if self.log is not None:
-            given = inputs.of(stamp_ns, motion.step, mapped_at) if is_known else None
+            given = inputs.of(self.log, stamp_ns, motion.step, mapped_at) if is_known else None
             self.log.put(step.index, given)
         return self._frame(step, scan, found, estimate, notices, correction, closure)
 
@@ -772,9 +771,9 @@ class _Inputs:
     search: LoopSearch | None = None
     corrections: tuple[TreeCorrection, ...] = ()
 
-    def of(self, stamp_ns: int, step: Pose2, estimate: PoseEstimate) -> TreeInput:
-        """Return the entry of the log."""
-        columns = None if self.columns is None else lean_columns(self.columns)
+    def of(self, log: TreeLog, stamp_ns: int, step: Pose2, estimate: PoseEstimate) -> TreeInput:
+        """Return the entry of a log."""
+        columns = None if self.columns is None else log.lean(self.columns)
         return TreeInput(
             stamp_ns, step, lean(estimate), self.keeps_state, self.seen, columns, self.votes, self.search,
             self.corrections,

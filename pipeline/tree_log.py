@@ -86,17 +86,30 @@ class TreeLog:
 
     def __init__(self) -> None:
         self._scans: list[TreeInput | None] = []
+        self._sizes: list[int] = []
         self._nbytes = 0
+        self._columns: Columns | None = None  # the last ones, with axes and votes only
 
     def put(self, index: int, known: TreeInput | None) -> None:
         """Store the input of a scan, in place of an earlier one; None if the trees cannot be made from it."""
-        self._nbytes += 0 if known is None else self._size(known)
+        if index > len(self._scans) or self._nbytes > MOST_BYTES:
+            return
+        size = 0 if known is None else _size(known, self._scans[index - 1] if index else None)
+        if index == len(self._scans):
+            self._scans.append(None)
+            self._sizes.append(0)
+        self._nbytes += size - self._sizes[index]
+        self._scans[index], self._sizes[index] = known, size
         if self._nbytes > MOST_BYTES:
             self._scans.clear()
-        elif index < len(self._scans):
-            self._scans[index] = known
-        elif index == len(self._scans):
-            self._scans.append(known)
+
+    def lean(self, columns: Columns) -> Columns:
+        """Return columns with axes and votes only; the other arrays are empty. Columns with the same axes
+        give the same record."""
+        if self._columns is None or self._columns.axis is not columns.axis:
+            names = [f.name for f in fields(columns) if f.name not in ("axis", "share")]
+            self._columns = replace(columns, **{name: getattr(columns, name)[:0].copy() for name in names})
+        return self._columns
 
     def at(self, index: int) -> TreeInput:
         """Return the input of a scan; TreesDifferError if it is not known."""
@@ -109,30 +122,23 @@ class TreeLog:
         """Return whether the inputs of the first scans are known."""
         return len(self._scans) >= scans and None not in self._scans[:scans]
 
-    def _size(self, known: TreeInput) -> int:
-        """Return the approximate memory that an input takes [bytes]: landmarks and columns are shared by the
-        scans that do not change them."""
-        size = SCAN_BYTES + sum(2 * each.correction.after.nbytes for each in known.corrections)
-        if known.votes is not None and known.columns is not None:
-            size += known.votes.nbytes + known.columns.axis.nbytes
-        last = self._scans[-1] if self._scans else None
-        if known.seen is not None and (
-            last is None or last.seen is None or last.seen[1].birth is not known.seen[1].birth
-        ):
-            size += LANDMARK_BYTES * len(known.seen[1].birth)
-        return size
+
+def _size(known: TreeInput, before: TreeInput | None) -> int:
+    """Return the approximate memory that an input takes in addition to that of the scan before [bytes]:
+    landmarks and columns are shared by the scans that do not change them."""
+    size = SCAN_BYTES + sum(2 * each.correction.after.nbytes for each in known.corrections)
+    if known.votes is not None and known.columns is not None:
+        size += known.votes.nbytes + known.columns.axis.nbytes
+    shared = before.seen[1].birth if before is not None and before.seen is not None else None
+    if known.seen is not None and known.seen[1].birth is not shared:
+        size += LANDMARK_BYTES * len(known.seen[1].birth)
+    return size
 
 
 def lean(estimate: PoseEstimate) -> PoseEstimate:
     """Return an estimate without particles, weights and landmarks."""
     nothing = np.zeros(0)
     return replace(estimate, particles=nothing, weights=nothing, landmarks=nothing)
-
-
-def lean_columns(columns: Columns) -> Columns:
-    """Return columns with axes and votes only; the other arrays are empty."""
-    names = [f.name for f in fields(columns) if f.name not in ("axis", "share")]
-    return replace(columns, **{name: getattr(columns, name)[:0].copy() for name in names})
 
 
 def are_same(a: Loop | None, b: Loop | None) -> bool:

@@ -19,6 +19,7 @@ from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.front_end import SegmentedScan
 from pipeline.mapper import Mapper
+from pipeline.tree_log import TreesDifferError
 from pipeline.types.records import Frame, Step, Trees
 
 URI = "sim:paper?duration=2.4&odometry=poor"
@@ -310,9 +311,10 @@ def test_a_change_from_here_on_leaves_the_map_before_it(session):
     assert session.status().remapped is None
 
 
+@pytest.mark.parametrize("parameters", [FEWER, LATER])
 @pytest.mark.parametrize("done", [3, 18])
-def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done):
-    session.set_parameters(FEWER, 1, whole=True)
+def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done, parameters):
+    session.set_parameters(parameters, 1, whole=True)
     for _ in range(done):
         session.remap()
     session.seek(1.5)
@@ -320,22 +322,52 @@ def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done):
     settle(session)
     frame, _ = remapped(session)
     assert frame.index == 15
-    assert told(frame) == mapped_with(FEWER, 15)[0]
+    assert told(frame) == mapped_with(parameters, 15)[0]
 
 
-def test_it_goes_on_while_the_run_plays(session):
+@pytest.mark.parametrize("parameters", [FEWER, LATER])
+def test_it_goes_on_while_the_run_plays(session, parameters):
     session.seek(1.0)
     settle(session)
-    session.set_parameters(FEWER, 1, whole=True)
+    session.set_parameters(parameters, 1, whole=True)
     session.play()
     done = None
     while done is None:
         session.work()
         done = session.remap() or session.remap()
     frame, _ = done
-    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+    assert told(frame) == mapped_with(parameters, frame.index)[0]
     after = session.work()
-    assert told(after) == mapped_with(FEWER, frame.index + 1)[0]
+    assert told(after) == mapped_with(parameters, frame.index + 1)[0]
+
+
+def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeypatch):
+    mapped: list[int] = []
+    process = Mapper.process
+
+    def process_and_note(mapper: Mapper, step: Step, scan: SegmentedScan | None = None) -> Frame:
+        mapped.append(step.index)
+        return process(mapper, step, scan)
+
+    monkeypatch.setattr(Mapper, "process", process_and_note)
+    for revision, wanted in enumerate([LATER, BASE.replace({"tracking.hits_to_confirm": 2})], 1):
+        session.set_parameters(wanted, revision, whole=True)
+        frame, _ = remapped(session)
+        assert set(mapped) == {frame.index}
+        assert (told(frame), told(session.path)) == mapped_with(wanted, frame.index)
+    session.seek(0.7)  # from a stored scan, or mapped again
+    settle(session)
+    assert told(session.run.map_again()) == mapped_with(wanted, 7)[0]
+
+
+def test_where_other_trees_close_another_loop_the_whole_run_is_mapped_again(session, monkeypatch):
+    def differs(_mapper: Mapper, _known: object) -> Trees:
+        raise TreesDifferError
+
+    monkeypatch.setattr(Mapper, "repeat", differs)
+    session.set_parameters(LATER, 1, whole=True)
+    frame, _ = remapped(session)
+    assert (told(frame), told(session.path)) == mapped_with(LATER, frame.index)
 
 
 def test_what_is_no_part_of_the_map_begins_nothing(session):
