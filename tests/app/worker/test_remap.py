@@ -351,6 +351,7 @@ def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeyp
 
     monkeypatch.setattr(Mapper, "process", process_and_note)
     for revision, wanted in enumerate([LATER, BASE.replace({"tracking.hits_to_confirm": 2})], 1):
+        mapped.clear()
         session.set_parameters(wanted, revision, whole=True)
         frame, _ = remapped(session)
         assert set(mapped) == {frame.index}
