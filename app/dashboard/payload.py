@@ -134,8 +134,8 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
     """Return the confirmed trees of a table as a list of dicts for the dashboard, with `number`, `x`, `y`
     [m], `ellipse` (see `ellipses`), `dbh_cm`, `sigma_dbh_cm`, `eccentricity`, `observations`, `coverage_deg`,
-    `first_seen_s`, `last_seen_s`, `height_m`, `sigma_height_m` and `lean_deg`. Unknown diameters,
-    eccentricities, coverages, heights and leans are None.
+    `first_seen_s`, `last_seen_s`, `height_m`, `sigma_height_m`, `lean_deg` and, of a tree without a diameter,
+    `sides`, see `Trees`. Unknown diameters, eccentricities, coverages, heights, leans and sides are None.
 
     Args:
         trees: The table.
@@ -144,6 +144,7 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
     keep = np.flatnonzero(trees.confirmed)
     unknown = np.full(len(trees.number), np.nan)
     lean = unknown if trees.lean is None else np.degrees(trees.lean)
+    sides = np.full(len(trees.number), np.nan) if trees.sides is None else trees.sides.astype(np.float64)
     columns: dict[str, Sequence[Any]] = {
         "number": trees.number[keep].tolist(),
         "x": _rounded(trees.position[keep, 0]),
@@ -159,6 +160,10 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
         "height_m": _finite((unknown if trees.height is None else trees.height)[keep]),
         "sigma_height_m": _finite((unknown if trees.height_sigma is None else trees.height_sigma)[keep]),
         "lean_deg": _finite(lean[keep]),
+        "sides": [
+            None if math.isnan(seen) or math.isfinite(dbh) else int(seen)
+            for seen, dbh in zip(sides[keep].tolist(), trees.dbh[keep].tolist(), strict=True)
+        ],
     }
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 

@@ -56,6 +56,7 @@ class MapNodes:
         self._circles = Circles(scene, "/world/breast", BREAST_HEIGHT, 4.0)
         self._truth = Circles(scene, "/world/truth", 0.04, 2.5)
         self._mark = Circles(scene, "/world/selection", 0.06, 5.0)
+        self._unseen = Segments(scene, "/world/unseen", 4.0)
         self._labels = LabelNodes(scene, "/world/numbers", 1.0)
         self._numbers: list[int] = []
         self._foot: Float = np.zeros(0)
@@ -148,6 +149,8 @@ class MapNodes:
             np.column_stack([radius, radius, height]),
             each,
         )
+        arcs = unseen_arcs(rows_of(trees, ~measured), foot[~measured])
+        self._unseen.show(view.layers["trees"], arcs, colours.UNCERTAIN)
         on = view.layers["fits"] and not of_drive
         self._circles.show_at(on, place[measured], radius[measured], each[measured], foot[measured])
 
@@ -172,6 +175,28 @@ class MapNodes:
             z = np.append(z, self.ground.heights(places[-1:], base_z))
         each = np.tile(np.array([colours.SELECTION], dtype=np.uint8), (len(radii), 1))
         self._mark.show_at(True, places, np.array(radii), each, z)
+
+
+SECTORS = 36  # of `Trees.sides`
+UNSEEN_RADIUS, UNSEEN_HEIGHT = 0.35, 0.05  # m, of the arcs around trees, above the ground
+
+
+def unseen_arcs(trees: Trees, foot: Float) -> Float:
+    """Return the sides from which trees were never seen as segments of rings at their feet, shape (S, 2, 3)
+    [m]; none if only the coverage is known.
+
+    Args:
+        trees: The trees, shape (T,).
+        foot: Height of the ground at each [m].
+    """
+    if trees.sides is None:
+        return np.zeros((0, 2, 3))
+    unseen = (trees.sides[:, None] >> np.arange(SECTORS) & 1) == 0
+    row, side = np.nonzero(unseen)
+    angle = 2.0 * np.pi / SECTORS * (side[:, None] + np.array([0.0, 1.0]))
+    around = UNSEEN_RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    height = np.broadcast_to((foot[row] + UNSEEN_HEIGHT)[:, None, None], (len(row), 2, 1))
+    return np.concatenate([np.round(trees.position[row], 2)[:, None] + around, height], axis=2)
 
 
 class TreeFeet:

@@ -249,3 +249,14 @@ def test_the_filter_ends_with_the_run(dashboard: Dashboard):
     expect(page.locator("#tree-count")).to_contain_text("0 of")
     dashboard.open("sim:stand?duration=3")
     expect(page.locator("#find")).to_have_value("")
+
+
+def test_the_head_of_the_table_and_the_map_tell_what_lacks_for_a_diameter(dashboard: Dashboard):
+    dashboard.stand(5.05)
+    dashboard.tab("Trees")
+    count = dashboard.page.locator("#tree-count")
+    expect(count).to_contain_text(re.compile(r"\d+ trees, \d+ needs? 180° of view for a DBH"))
+    lacking = [tree for tree in dashboard.ask("/api/trees")["trees"] if tree["dbh_cm"] is None]
+    assert lacking
+    assert all(0 <= tree["sides"] < 2**36 for tree in lacking)
+    expect(dashboard.page.locator("#legend-unseen")).to_be_visible()

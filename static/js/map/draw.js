@@ -11,6 +11,7 @@ const TURN = 2 * Math.PI;
 export const symbolRadius = (tree, scale) =>
   Math.max(tree.dbh_cm === null ? 3.5 : 3 + 0.11 * tree.dbh_cm, tree.dbh_cm === null ? 0 : (tree.dbh_cm / 200) * scale);
 
+const SECTORS = 36; // around a trunk
 const LEFT_OUT = 0.2; // opacity of trees that the filter of the table leaves out
 const TREE_REACH = 14; // [px] around the symbol of a tree
 
@@ -185,6 +186,7 @@ export function drawTree(pen, view, tree, selected, rejected = false) {
     pen.fillStyle = colour;
     pen.fill();
   }
+  if (tree.sides !== null && tree.sides !== undefined) drawUnseen(pen, px, py, symbolRadius(tree, view.scale) + 4, tree.sides);
   if (rejected) drawCross(pen, px, py, symbolRadius(tree, view.scale) + 2);
   const [major, minor, angle] = tree.ellipse;
   if (major * view.scale > 2) {
@@ -200,6 +202,19 @@ export function drawTree(pen, view, tree, selected, rejected = false) {
     drawCircle(pen, px, py, symbolRadius(tree, view.scale) + 5);
     pen.stroke();
   }
+}
+
+// The sides from which a tree without a diameter was never seen, as arcs; bit k is sector k, from x to y of the map.
+function drawUnseen(pen, px, py, radius, sides) {
+  const step = TURN / SECTORS;
+  Object.assign(pen, { strokeStyle: colours.warn, lineWidth: 2.5 });
+  pen.beginPath();
+  for (let k = 0; k < SECTORS; k += 1) {
+    if (Math.floor(sides / 2 ** k) % 2) continue;
+    pen.moveTo(px + radius * Math.cos(k * step), py - radius * Math.sin(k * step));
+    pen.arc(px, py, radius, -k * step, -(k + 1) * step, true);
+  }
+  pen.stroke();
 }
 
 function drawCross(pen, px, py, reach) {

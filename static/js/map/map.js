@@ -98,7 +98,7 @@ const isRejected = (tree) => reviewOf(tree) === "rejected";
 function showLegend() {
   const kinds = (state.truth ?? []).map(({ kind }) => kind);
   const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"),
-    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: isDrive() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
+    hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
   setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");
 }

@@ -113,13 +113,23 @@ function fill() {
   });
   while (body.rows.length > listed.length) body.lastChild.remove();
   keepTabStop();
-  setText(byId("tree-count"), wanted ? `${listed.length} of ${all.length}` : count(all.length, "tree"));
+  setText(byId("tree-count"), wanted ? `${listed.length} of ${all.length}` : `${count(all.length, "tree")}${missing(all)}`);
   suitColumns();
   byId("trees").hidden = !listed.length;
   byId("trees-png").disabled = !listed.length;
   offerCsv(all.length);
   byId("find").setAttribute("aria-invalid", String(Boolean(refused)));
   setText(byId("trees-empty"), listed.length ? "" : emptyText(all.length, wanted, refused));
+}
+
+// Why trees have no diameter: the arc that was seen is too short, or the diameter is too uncertain.
+function missing(all) {
+  if (!isDrive()) return "";
+  const arc = state.parameters?.values["tracking.dbh_arc_min"] ?? 0;
+  const without = all.filter((tree) => tree.dbh_cm === null);
+  const short = without.filter((tree) => (tree.coverage_deg ?? 0) < arc).length;
+  return [[short, `need ${fixed(arc, 0)}° of view for a DBH`], [without.length - short, "with an uncertain DBH"]]
+    .filter(([number]) => number).map(([number, words]) => `, ${number} ${number === 1 ? words.replace("need ", "needs ") : words}`).join("");
 }
 
 let dimmed = ""; // the filter of which the map knows

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from app.scene import Scene
+from app.scene.map import unseen_arcs
 from app.scene.nodes import MOST_LABELS, Label, LabelNodes, short
 from app.scene.scan import cluster_labels
 from tests.app.scene.frames import make_frame, make_trees, texts_of
+from tests.pipeline.strategies import trees
 
 PATH = np.zeros((1, 4))
 
@@ -79,3 +81,14 @@ def test_a_stem_of_another_program_is_labelled_and_drawn_without_eccentricity_an
     fits = scene._server.scene.get_handle_by_name("/world/robot/scan/fits")
     assert fits is not None
     assert np.isfinite(fits.batched_scales).all()  # type: ignore[attr-defined]
+
+
+def test_the_arcs_of_a_tree_without_a_diameter_are_the_sides_that_were_never_seen():
+    seen = (1 << 36) - 1 - (0b111 << 8)  # all but 80 to 110 degrees
+    one = replace(trees([[2.0, 1.0]]), sides=np.array([seen]))
+    arcs = unseen_arcs(one, np.array([0.3]))
+    assert arcs.shape == (3, 2, 3)
+    angle = np.degrees(np.arctan2(arcs[:, :, 1] - 1.0, arcs[:, :, 0] - 2.0))
+    np.testing.assert_allclose(angle, [[80, 90], [90, 100], [100, 110]], atol=1e-6)
+    np.testing.assert_allclose(arcs[:, :, 2], 0.35)
+    assert len(unseen_arcs(replace(one, sides=None), np.array([0.0]))) == 0
