@@ -217,13 +217,15 @@ class ViewSettings:
     def as_plain(self) -> dict[str, Any]:
         """Return the state as a dict for the dashboard: `layers`, a list of dicts in the order of LAYERS with
         `name`, `title`, `on` and `colour` ("#rrggbb" or None); `follow`; and for each name in CHOICES a dict
-        with `value` and `of`, the list of possible values."""
+        with `value` and `of`, the list of possible values; and `ramp`, the colours of `ramp` from its lower
+        to its upper end."""
         layers = [
             {"name": name, "title": layer.title, "on": self.layers[name], "colour": _hex(layer.colour)}
             for name, layer in LAYERS.items()
         ]
         choices = {name: {"value": getattr(self, name), "of": list(of)} for name, of in CHOICES.items()}
-        return {"layers": layers, "follow": self.follow, **choices}
+        supports = ["#{:02x}{:02x}{:02x}".format(*map(int, rgb)) for rgb in _RAMP]
+        return {"layers": layers, "follow": self.follow, **choices, "ramp": supports}
 
 
 def _hex(colour: Rgb | None) -> str | None:

@@ -2,14 +2,20 @@
 
 import { patch } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
+import { capital } from "../core/format.js";
 import { startPopover } from "../core/popover.js";
 import { attempted } from "../core/problem.js";
-import { on, state } from "../core/store.js";
+import { isDrive, on, state } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { pressInScene } from "./scene.js";
 
 const EVERY = 500; // [ms] between two updates of the counts
 const TITLES = { colour_by: "Colour by", label_by: "Labels", accumulated: "Accumulated" };
+// What the colours of the scene mean where they are a ramp: title and ticks.
+const BARS = {
+  height: (drive) => (drive ? ["height of the scan relative to the sensor", ["−1 m", "+1 m", "+3 m"]] : ["height", ["low", "high"]]),
+  eccentricity: () => ["eccentricity e of a cluster", ["1 round", "10", "100 a line"]],
+};
 const counts = {};
 const newest = {}; // newest counts by layer
 
@@ -42,7 +48,18 @@ function show() {
     return el("label", { class: "choice" }, el("span", { text: title }), list);
   });
   byId("layer-list").replaceChildren(...rows, ...choices);
+  showBar(view);
   count();
+}
+
+function showBar({ colour_by: { value }, ramp }) {
+  const bar = byId("colour-bar"), words = BARS[value];
+  bar.hidden = !words;
+  if (!words) return;
+  const [title, ticks] = words(isDrive());
+  setText(bar.querySelector("figcaption"), capital(title));
+  bar.querySelector("i").style.background = `linear-gradient(90deg, ${ramp.join(", ")})`;
+  bar.querySelector("ol").replaceChildren(...ticks.map((text) => el("li", { text })));
 }
 
 function count() {

@@ -3,12 +3,13 @@
 
 import { byId, el, recall, remember } from "../core/dom.js";
 import { startPopover } from "../core/popover.js";
-import { on, state } from "../core/store.js";
+import { on, state, trees } from "../core/store.js";
 import { onSceneBuilt } from "./scene.js";
 
 const MOST_VIEWS = 20, MOST_SOURCES = 30, LONGEST_NAME = 40;
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
-let scene = null;
+const FIT_TILT = (60 * Math.PI) / 180; // [rad] of the view of the whole map, above the horizon
+let scene = null, home = null;
 
 function stored() {
   try {
@@ -51,6 +52,25 @@ export function lookFrom(view) {
   at.control.setLookAt(...from.toArray(), ...to.toArray(), !calm.matches);
 }
 
+// Where the camera stood when the scene was loaded, relative to the robot if it is followed.
+function goHome() {
+  if (!home || !parts()) return;
+  parts().control.setLookAt(...home, !calm.matches);
+}
+
+// From above and behind, so that path and trees are in the picture.
+function fit() {
+  const places = [...state.path.map(([x, y]) => [x, y]), ...trees().map(({ x, y }) => [x, y])], at = parts();
+  if (!places.length || !at) return;
+  const [xs, ys] = [0, 1].map((axis) => places.map((place) => place[axis]));
+  const ends = [xs, ys].map((all) => [all.reduce((a, b) => Math.min(a, b)), all.reduce((a, b) => Math.max(a, b))]);
+  const [x, y] = ends.map(([low, high]) => (low + high) / 2);
+  const radius = Math.max(3, Math.hypot(...ends.map(([low, high]) => (high - low) / 2)));
+  const narrow = Math.min(1, at.camera.aspect) * Math.tan((at.camera.fov * Math.PI) / 360);
+  const away = radius / narrow;
+  lookFrom([x, y - away * Math.cos(FIT_TILT), away * Math.sin(FIT_TILT), x, y, 0]);
+}
+
 function save(event) {
   event.preventDefault();
   const name = byId("view-name").value.trim(), view = present();
@@ -74,5 +94,11 @@ function show() {
 export function startViews() {
   startPopover(byId("views-button"), byId("view-list"), show);
   on("source", show);
-  onSceneBuilt((inner) => { scene = inner; });
+  byId("look-home").addEventListener("click", goHome);
+  byId("look-fit").addEventListener("click", fit);
+  onSceneBuilt((inner) => {
+    scene = inner;
+    const at = parts();
+    home = at && [at.control.getPosition(at.camera.position.clone()), at.control.getTarget(at.camera.position.clone())].flatMap((each) => each.toArray());
+  });
 }

@@ -53,6 +53,7 @@ export const ACTIONS = [
   ["Focus: move the camera to the selected tree or cluster, or stop", "", "", toggleFocus],
   ["View the robot from above", "t", "", edits(() => pressInScene("t"))], ["View the robot from behind", "b", "", edits(() => pressInScene("b"))],
   ["Views: save this view of the scene, or return to a saved one", "", "", click("views-button"), null, "camera bookmark viewpoint position"],
+  ["View the whole map in the scene", "", "", click("look-fit"), null, "fit zoom all camera"], ["Return to the first view of the scene", "", "", click("look-home"), null, "home reset camera"],
   ["Measure a distance on the map", "m", "m", toggleMeasure],
   ["Show the whole map", "", "", click("map-fit"), null, "fit zoom reset"],
   ["Zoom in on the map", "+", "", pressOnMap("+"), null, "enlarge magnify closer"], ["Zoom out of the map", "-", "", pressOnMap("-"), null, "shrink farther"],

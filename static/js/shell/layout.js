@@ -19,6 +19,7 @@ const TABS = { Monitor: "trees", Tune: "tune", Annotate: "annotate", Results: "s
 const LEAST = 15, MOST = 80; // [%]
 const STEP = 2; // [%] by an arrow key
 const LONGEST_NAME = 40, MOST_SAVED = 20;
+const low = matchMedia("(max-height: 799px)");
 const work = document.querySelector(".work");
 let layout = { ...STANDARD };
 let saved = {};
@@ -62,6 +63,8 @@ function show() {
   work.classList.toggle("exchanged", layout.exchanged && layout.map);
   work.classList.toggle("no-map", !layout.map);
   work.classList.toggle("no-tabs", !layout.tabs);
+  // In a low window, sliders would leave the map a strip: the scene alone shows what they do.
+  work.classList.toggle("no-upper", low.matches && visible("tune") && layout.exchanged && layout.map && layout.tabs && layout.upper === STANDARD.upper);
   for (const [id, value] of [["split-left", layout.left], ["split-top", layout[height()]]]) byId(id).setAttribute("aria-valuenow", String(Math.round(value)));
   byId("map-exchange").setAttribute("aria-pressed", String(layout.exchanged));
   byId("layout-map").checked = layout.map;
@@ -134,6 +137,7 @@ export function startLayout() {
   startSplitter("split-left", () => "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
   startSplitter("split-top", height, { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (event.clientY - box.top)) / box.height);
   on("tab", show);
+  low.addEventListener("change", show);
   saved = stored("layouts");
   setLayout(stored("layout"));
 }
