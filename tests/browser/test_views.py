@@ -38,3 +38,25 @@ def test_a_saved_view_returns_to_the_same_place_of_the_map(dashboard: Dashboard)
     expect(page.locator("#view-list")).to_contain_text("Save this view of the scene")
     page.locator("#view-name").press("Escape")
     expect(page.locator("#view-list")).to_be_hidden()
+
+
+@pytest.mark.usefixtures("calm")
+def test_the_whole_map_is_shown_and_home_returns_to_the_first_view(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.load_scene()
+    scene = dashboard.scene
+    page.locator("#look-home").click()
+    dashboard.settled_places("/world/trees")
+    first = scene.evaluate(CAMERA)
+    page.locator("#look-fit").click()
+    dashboard.eventually(lambda: scene.evaluate(CAMERA)[2] > first[2] + 5.0, lambda: scene.evaluate(CAMERA))
+    page.locator("#look-home").click()
+    dashboard.eventually(lambda: scene.evaluate(CAMERA) == first, lambda: scene.evaluate(CAMERA))
+    dashboard.page.evaluate(CHOOSE, ["colour_by", "eccentricity"])
+    expect(page.locator("#colour-bar")).to_contain_text("Eccentricity e of a cluster")
+    dashboard.page.evaluate(CHOOSE, ["colour_by", "verdict"])
+    expect(page.locator("#colour-bar")).to_be_hidden()
+
+
+CHOOSE = """([name, value]) => fetch('/api/view', { method: 'PATCH', body: JSON.stringify({ name, value }),
+  headers: { 'Content-Type': 'application/json' } })"""

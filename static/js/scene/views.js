@@ -9,6 +9,7 @@ import { onSceneBuilt } from "./scene.js";
 const MOST_VIEWS = 20, MOST_SOURCES = 30, LONGEST_NAME = 40;
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
 const FIT_TILT = (60 * Math.PI) / 180; // [rad] of the view of the whole map, above the horizon
+const HOME_MS = 200; // between two looks whether the camera is there
 let scene = null, home = null;
 
 function stored() {
@@ -53,6 +54,13 @@ export function lookFrom(view) {
 }
 
 // Where the camera stood when the scene was loaded, relative to the robot if it is followed.
+function keepHome(inner) {
+  const at = parts();
+  if (scene !== inner) return;
+  if (!at) setTimeout(() => keepHome(inner), HOME_MS);
+  else home = [at.control.getPosition(at.camera.position.clone()), at.control.getTarget(at.camera.position.clone())].flatMap((each) => each.toArray());
+}
+
 function goHome() {
   if (!home || !parts()) return;
   parts().control.setLookAt(...home, !calm.matches);
@@ -98,7 +106,6 @@ export function startViews() {
   byId("look-fit").addEventListener("click", fit);
   onSceneBuilt((inner) => {
     scene = inner;
-    const at = parts();
-    home = at && [at.control.getPosition(at.camera.position.clone()), at.control.getTarget(at.camera.position.clone())].flatMap((each) => each.toArray());
+    keepHome(inner);
   });
 }

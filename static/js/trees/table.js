@@ -113,6 +113,7 @@ function fill() {
   });
   while (body.rows.length > listed.length) body.lastChild.remove();
   keepTabStop();
+  byId("tree-count").title = `A diameter is reported once ${fixed(state.parameters?.values["tracking.dbh_arc_min"] ?? 0, 0)}° of a trunk were seen and its sigma is small enough; arcs on the map are the sides that were never seen`;
   setText(byId("tree-count"), wanted ? `${listed.length} of ${all.length}` : `${count(all.length, "tree")}${missing(all)}`);
   suitColumns();
   byId("trees").hidden = !listed.length;
@@ -128,7 +129,7 @@ function missing(all) {
   const arc = state.parameters?.values["tracking.dbh_arc_min"] ?? 0;
   const without = all.filter((tree) => tree.dbh_cm === null);
   const short = without.filter((tree) => (tree.coverage_deg ?? 0) < arc).length;
-  return [[short, `need ${fixed(arc, 0)}° of view for a DBH`], [without.length - short, "with an uncertain DBH"]]
+  return [[short, `need ${fixed(arc, 0)}° of view`], [without.length - short, "with uncertain DBH"]]
     .filter(([number]) => number).map(([number, words]) => `, ${number} ${number === 1 ? words.replace("need ", "needs ") : words}`).join("");
 }
 
