@@ -126,6 +126,10 @@ def test_help_loads_nothing_heavy(words):
 def test_the_web_process_starts_without_numerical_libraries():
     code = (
         "import sys, app.web.app, app.web.serving, app.scene.scene\n"
+        "from app.common.settings import Settings\nfrom app.dashboard.parameters import ParameterState\n"
+        "from app.web.auth import AccessTokens\nfrom app.worker.protocol import Open\n"
+        "app.web.app.build(Settings(), port=1, tokens=AccessTokens('t' * 16), source=Open('sim:paper'),\n"
+        "    parameter_state=ParameterState())\n"
         "print('HEAVY', sorted({'numba', 'scipy', 'sklearn', 'open3d'} & set(sys.modules)))"
     )
     told = subprocess.run(

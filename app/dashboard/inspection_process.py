@@ -161,6 +161,24 @@ def export(question: dict[str, Any]) -> dict[str, Any]:
     return {"file": str(export_one_file(run, question["suffix"], WRITERS, Path(question["folder"])))}
 
 
+def layer(question: dict[str, Any]) -> dict[str, Any]:
+    """Write the trees or the path of a run as GeoJSON; return {"file": its path}.
+
+    Args:
+        question: The key "path" has the folder of the run, "layer" is "trees" or "path", and "folder" has the
+            empty folder of the file.
+
+    Raises:
+        StemmapError, OSError: See `app.batch.export.read_for_export`.
+    """
+    from app.batch.export import path_geojson, read_for_export, trees_geojson
+
+    run, name = read_for_export(Path(question["path"])), question["layer"]
+    file = Path(question["folder"]) / f"{name}.geojson"
+    file.write_text(trees_geojson(run) if name == "trees" else path_geojson(run), encoding="utf-8")
+    return {"file": str(file)}
+
+
 def alignment(question: dict[str, Any]) -> dict[str, Any]:
     """Match two maps by their stems. Return a dict with `pose`, [x [m], y [m], yaw [rad]] of the map `local`
     in the frame of `reference`, or None if there is no match; `reason`, why there is none, else ""; and
@@ -200,6 +218,7 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "finished": finished,
     "cloud": cloud,
     "export": export,
+    "layer": layer,
     "alignment": alignment,
 }
 

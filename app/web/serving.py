@@ -22,6 +22,7 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from app.common.memory import return_freed_memory
 from app.common.settings import DEFAULT_PORT, MESSAGE_LIMIT, Settings
 from app.dashboard.parameters import ParameterState
 from app.web.auth import AccessTokens
@@ -169,6 +170,7 @@ def run_server(settings: Settings, make_app: Callable[[int, AccessTokens], Await
         StemmapError: The port is in use, or the address is not an address of this machine.
         SystemExit: The application fails at its start; the code is that of uvicorn.
     """
+    return_freed_memory()
     listening = bind(settings)
     port = listening.getsockname()[1]
     tokens = AccessTokens.of(settings)

@@ -67,6 +67,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--starts", metavar="N", type=flags.whole_number(1, 10**5), help="starts of each pair of `localise`"
     )
+    parser.add_argument(
+        "--openings", metavar="N", type=flags.whole_number(1, 10**5), help="sources of `many_sources`"
+    )
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures as JSON")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
@@ -88,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the benchmarks and write docs/benchmarks.md or --out; with --list or --pictures only list them or
-    draw pictures. --seeds, --hours, --scans and --starts are passed on by environment variables.
+    draw pictures. --seeds, --hours, --scans, --starts and --openings are passed on by environment variables.
 
     Returns:
         Exit code: 1 if a benchmark failed, else 0.
@@ -109,7 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
     day = arguments.date or date.today()
     if arguments.seeds is not None:
         os.environ[VARIABLE] = arguments.seeds
-    for name in ("hours", "scans", "starts"):
+    for name in ("hours", "scans", "starts", "openings"):
         if (value := getattr(arguments, name)) is not None:
             os.environ[f"STEMMAP_BENCH_{name.upper()}"] = str(value)
     failed = runner.run(arguments.names, out=out, json_file=arguments.json, day=day)

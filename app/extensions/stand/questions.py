@@ -12,8 +12,8 @@ from pipeline.errors import StemmapError
 if TYPE_CHECKING:
     from app.extensions.stand.plots import SamplePlot
 
-PLOTS_OF_FILE, GEOREFERENCE, REPORT, VISITS, EXPORT = (
-    f"{__name__}:{name}" for name in ("plots", "georeference", "report", "visits", "export")
+PLOTS_OF_FILE, GEOREFERENCE, REPORT, VISITS, EXPORT, LAYER = (
+    f"{__name__}:{name}" for name in ("plots", "georeference", "report", "visits", "export", "layer")
 )
 
 
@@ -118,6 +118,28 @@ def export(question: dict[str, Any]) -> dict[str, Any]:
     parameters = Stand.model_validate(question["parameters"])
     run = read_with_plots(folder, stand_of(folder, parameters, plots) if plots else None)
     return {"file": str(export_one_file(run, question["suffix"], WRITERS, Path(question["folder"])))}
+
+
+def layer(question: dict[str, Any]) -> dict[str, Any]:
+    """Write the plots of a run as GeoJSON, see `shapes_geojson`; return {"file": its path}.
+
+    Args:
+        question: The key "path" has the folder of the run, "folder" the empty folder of the file, and "plots"
+            is as in `export`.
+
+    Raises:
+        StemmapError, OSError: The run cannot be read, or the file cannot be written.
+    """
+    import shapely
+
+    from app.batch.export import shapes_geojson
+    from app.batch.map_frame import read_map_frame
+
+    frame = read_map_frame(Path(question["path"]))
+    placed = [(plot.name, shapely.transform(plot.shape, frame.to_crs)) for plot in _plots_of(question)]
+    file = Path(question["folder"]) / "plots.geojson"
+    file.write_text(shapes_geojson(placed, frame), encoding="utf-8")
+    return {"file": str(file)}
 
 
 def _plots_of(question: dict[str, Any]) -> list[SamplePlot]:

@@ -44,6 +44,7 @@ from pipeline.io.block_file import LARGE
 
 router = APIRouter(prefix="/api")
 
+GEOJSON = "application/geo+json"
 # Reading a long recording again.
 _EXPORT_S = 600.0
 _Scan = Annotated[int | None, Query(ge=0, le=LARGEST_NUMBER)]
@@ -130,7 +131,11 @@ async def export(
 
 
 async def exported_file(
-    dashboard: Dashboard, run: ShownRun, question: dict[str, Any], there: FilePath
+    dashboard: Dashboard,
+    run: ShownRun,
+    question: dict[str, Any],
+    there: FilePath,
+    media_type: str = "application/octet-stream",
 ) -> Response:
     """Return the file that a child process exports, one at a time. Its answer has the path of the file as
     `file`; the question is extended by the folder of the run, "path", and the empty folder of the file,
@@ -144,28 +149,19 @@ async def exported_file(
             except opening.TookTooLongError:
                 raise StemmapError(f"the export takes longer than {_EXPORT_S:.0f} s") from None
     file = FilePath(answer["file"])
-    return FileResponse(
-        file, 200, {"Cache-Control": "no-store"}, "application/octet-stream", filename=file.name
-    )
+    return FileResponse(file, 200, {"Cache-Control": "no-store"}, media_type, filename=file.name)
 
 
 @router.get("/layers/{layer}.geojson", dependencies=[ViewerTurn])
-async def layer(layer: Literal["trees", "path"], dashboard: Dash) -> Response:
+async def layer(
+    layer: Literal["trees", "path"],
+    dashboard: Dash,
+    there: Annotated[FilePath, Depends(folder_of_export)],
+) -> Response:
     """Return the trees or the path of the present map as GeoJSON for other programs, which ask again to be up
-    to date: in WGS84, or in the frame of a local map. 409 before the first map."""
-    run = ShownRun.of(dashboard)
-    with as_bad_request():
-        text = await asyncio.to_thread(_layer_text, run, layer)
-    return text_reply(text, f"{layer}.geojson", "application/geo+json")
-
-
-def _layer_text(run: ShownRun, layer: Literal["trees", "path"]) -> str:
-    """Return a layer of a run as GeoJSON."""
-    from app.batch import export
-
-    with run.folder() as folder:
-        exported = export.read_for_export(folder)
-    return export.trees_geojson(exported) if layer == "trees" else export.path_geojson(exported)
+    to date: in WGS84, or in the frame of a local map; a child process writes it. 409 before the first map."""
+    question = {"ask": "layer", "layer": layer}
+    return await exported_file(dashboard, ShownRun.of(dashboard), question, there, GEOJSON)
 
 
 @router.get("/evaluation")

@@ -53,7 +53,6 @@ from pipeline.io.readers.topics import (
     group_topics,
 )
 from pipeline.io.readers.transforms import MOVING_MESSAGES, Extrinsics, TransformTree, frame_name
-from pipeline.odometry.mounting_yaw import lidar_path, overlap, yaw_of_mounting
 from pipeline.types.records import Imu, Int, Notice, Odometry, Record, Scan, Sensor, Truth
 from pipeline.types.units import SECOND_NS
 
@@ -596,6 +595,9 @@ class RosSource(MessageSource):
         Args:
             level: T_base_lidar by the ground in the first scan, None for an upright LiDAR.
         """
+        # Compiled kernels and SciPy, which a process that only records or serves does not need.
+        from pipeline.odometry.mounting_yaw import lidar_path, overlap, yaw_of_mounting
+
         times_ns, path = self._odometry_path()
         if len(times_ns) < 2:
             return level

@@ -22,6 +22,7 @@ from tests.benchmarks.child import answers
 
 _CLOUD_BYTES = 10_000  # a message of viser with points of a scan has more, those of sliders less
 _LONGEST_S = 60.0
+_EXPORT_S = 300.0
 
 
 class Browser:
@@ -93,6 +94,10 @@ class Browsers:
             case {"do": "command", "command": command}:
                 (await self._web.post("/api/command", json=command)).raise_for_status()
                 return {}
+            case {"do": "open", "uri": uri}:
+                return {"code": (await self._web.post("/api/open", json={"uri": uri})).status_code}
+            case {"do": "get", "path": path}:
+                return {"code": (await self._web.get(path, timeout=_EXPORT_S)).status_code}
             case {"do": "status"}:
                 status: dict[str, Any] = (await self._web.get("/api/status")).json()
                 return status

@@ -17,6 +17,7 @@ from typing import Any
 import uvicorn
 
 from app.common.child_process import python_module
+from app.common.memory import return_freed_memory
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
@@ -56,6 +57,7 @@ class Served:
 
     async def run(self) -> None:
         """Serve until the questions end."""
+        return_freed_memory()
         serving = asyncio.create_task(self._server.serve(sockets=[self._listening]))
         with answers() as pipe:
             while line := await asyncio.to_thread(sys.stdin.readline):

@@ -17,12 +17,12 @@ from app.dashboard.shown_run import ShownRun
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plot_files import plots_of_run, stored_plots
 from app.extensions.stand.plots import SamplePlot
-from app.extensions.stand.questions import EXPORT, REPORT
+from app.extensions.stand.questions import EXPORT, LAYER, REPORT
 from app.extensions.stand.routes.figure_parameters import FigureParameters
 from app.sources import opening
-from app.web.responses import as_bad_request, bytes_reply, text_reply
+from app.web.responses import bytes_reply
 from app.web.routes.access import Dash, Deployment, ViewerTurn
-from app.web.routes.results import exported_file, folder_of_export
+from app.web.routes.results import GEOJSON, exported_file, folder_of_export
 from app.web.routes.runs import Key, is_open_run, run_folder
 
 router = APIRouter(prefix="/api")
@@ -32,26 +32,12 @@ _REPORT_S = 240.0
 
 
 @router.get("/layers/plots.geojson", dependencies=[ViewerTurn])
-async def plots_layer(dashboard: Dash) -> Response:
-    """Return the plots of the run as GeoJSON, in the coordinates of the other layers. 409 before the first
-    map."""
+async def plots_layer(dashboard: Dash, there: Annotated[FilePath, Depends(folder_of_export)]) -> Response:
+    """Return the plots of the run as GeoJSON, in the coordinates of the other layers; a child process writes
+    them. 409 before the first map."""
     run = ShownRun.of(dashboard)
-    with as_bad_request():
-        text = await asyncio.to_thread(_plots_geojson, run)
-    return text_reply(text, "plots.geojson", "application/geo+json")
-
-
-def _plots_geojson(run: ShownRun) -> str:
-    """Return the plots of a run as GeoJSON, see `shapes_geojson`."""
-    import shapely
-
-    from app.batch.export import shapes_geojson
-    from app.batch.map_frame import read_map_frame
-
-    with run.folder() as folder:
-        frame = read_map_frame(folder)
-    placed = [(plot.name, shapely.transform(plot.shape, frame.to_crs)) for plot in plots_of_run(run)]
-    return shapes_geojson(placed, frame)
+    plots = [(plot.name, mapping(plot.shape)) for plot in plots_of_run(run)]
+    return await exported_file(dashboard, run, {"ask": LAYER, "plots": plots}, there, GEOJSON)
 
 
 def _add_export(suffix: str) -> None:
