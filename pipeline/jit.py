@@ -28,6 +28,7 @@ from typing import Any, ParamSpec, TypeVar
 import llvmlite.binding
 import numba
 from numba.core import event
+from numba.core.targetconfig import TargetConfig
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -81,7 +82,21 @@ def fix_target() -> None:
         numba.config.CPU_NAME, numba.config.CPU_FEATURES = name, ""
 
 
+def _compare_flags_quickly() -> None:
+    """Let Numba compare its compiler flags by the options that are set. It makes a dict of all 40 options for
+    each hash and each comparison, of which it needs so many that they take a tenth of a compilation."""
+    all_options: Callable[[TargetConfig, object], bool] = TargetConfig.__eq__
+
+    def is_same(flags: TargetConfig, other: object) -> bool:
+        same_options = isinstance(other, TargetConfig) and flags._values == other._values
+        return same_options or all_options(flags, other)
+
+    TargetConfig.__hash__ = lambda flags: hash(type(flags))  # of the names of the options, so far
+    TargetConfig.__eq__ = is_same
+
+
 fix_target()
+_compare_flags_quickly()
 _kernels: dict[Any, bool] = {}  # whether its machine code was found in the cache so far
 
 
@@ -95,8 +110,22 @@ def _kernel(function: Callable[P, R], **options: object) -> Callable[P, R]:
         **options,
     )(function)
     _keep_by_all_sources(kernel, function.__module__)
+    _take_no_constants(kernel)
     _kernels[kernel] = False
     return kernel
+
+
+def _take_no_constants(kernel: Any) -> None:  # noqa: ANN401
+    """Let a kernel be compiled for int64 where another kernel passes a constant integer. Numba would compile
+    it once for the constant and once more for variables; LLVM knows the constant where it inlines the
+    kernel."""
+    template = kernel.get_call_template
+
+    def without_constants(args: tuple[Any, ...], kws: dict[str, Any]) -> Any:  # noqa: ANN401
+        plain = {name: numba.types.unliteral(kind) for name, kind in kws.items()}
+        return template(tuple(map(numba.types.unliteral, args)), plain)
+
+    kernel.get_call_template = without_constants
 
 
 def count_kept() -> int:

@@ -63,7 +63,11 @@ def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> F
             b = direction_bin(x + offset[0], y + offset[1], BINS)
             steepest[b] = max(steepest[b], points[i, 2] / rho)
     if all_around:
-        steepest[:] = steepest.max()
+        highest = -1.0
+        for b in range(BINS):
+            highest = max(highest, steepest[b])
+        for b in range(BINS):
+            steepest[b] = highest
     return steepest
 
 

@@ -520,7 +520,10 @@ def _rows_around(tx: int, ty: int, margin: float, tables: _Tables) -> Int:
             while row >= 0:
                 if low_x <= mean[row, 0] < high_x and low_y <= mean[row, 1] < high_y:
                     if n == rows.shape[0]:
-                        rows = np.append(rows, np.empty(n, np.int64))
+                        longer = np.empty(2 * n, np.int64)
+                        for k in range(n):
+                            longer[k] = rows[k]
+                        rows = longer
                     rows[n] = row
                     n += 1
                 row = np.int64(following[row])

@@ -14,6 +14,7 @@ import numpy as np
 
 from pipeline.detection.cylinder_fit import BARK, PRIOR_LEAN_SIGMA
 from pipeline.geometry.hash_grid import group_rows
+from pipeline.geometry.ordering import ascending_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Clusters, Float32, Int, Int32, Labels, Sensor
@@ -199,7 +200,7 @@ def _find_runs(
         reach[i] = np.sqrt(px * px + py * py)
         level[i] = int((pz - lowest) / SLICE)
         key[i] = level[i] + 0.5 + 0.499 * across[i] / (1.0 + abs(across[i]))
-    order = np.argsort(key)
+    order = ascending_rows(key)
     found, begin, jump = 0, 0, JUMP + JUMP_SIGMA * sigma
     for k in range(1, n + 1):
         if k < n:
@@ -297,18 +298,21 @@ def _find_trunk(runs: Runs, found: int, level: Int, slices: int) -> bool:
         agree, own = _count_agreeing_slices(runs, found, seed)
         if agree > most or (agree == most and own > returns):
             most, returns = agree, own
-            runs.best[:found] = runs.agrees[:found]
+            for run in range(found):
+                runs.best[run] = runs.agrees[run]
     if most < slices:
         return False
-    lowest, highest = level.max(), 0
+    highest = 0
+    lowest = runs.level[found - 1]  # ordered by slice
     for a in range(found):
         if runs.best[a]:
             lowest, highest = min(lowest, runs.level[a]), max(highest, runs.level[a])
-    seen = np.zeros(highest + 1, np.bool_)
+    seen, filled = np.zeros(highest + 1, np.bool_), 0
     for here in level:
-        if here <= highest:
+        if lowest <= here <= highest and not seen[here]:
             seen[here] = True
-    return bool(most >= SHARE * np.count_nonzero(seen[lowest:]))
+            filled += 1
+    return bool(most >= SHARE * filled)
 
 
 @compiled

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.geometry.gaussian import factorise, solve
+from pipeline.geometry.ordering import ascending, quantile
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_sums
 from pipeline.types.records import Int, Sensor
@@ -197,7 +198,7 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf
     shift = c * lean_y - s * lean_x
     for i in range(n):
         across[i] = rays[2, i] * (c * rays[1, i] - s * rays[0, i]) - shift * rays[3, i]
-    ordered = np.sort(across)
+    ordered = across.copy()
     first, middle = quantile(ordered, 0.25), quantile(ordered, 0.5)
     radius = quantile(ordered, 0.75) - first
     m = 0
@@ -209,18 +210,8 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf
         for i in range(n):
             front[i] = rays[2, i] * (c * rays[0, i] + s * rays[1, i])
         m = n
-    reach = quantile(np.sort(front[:m]), 0.5)
+    reach = quantile(front[:m], 0.5)
     return MiddleHalf(c, s, middle, c * reach - s * middle, s * reach + c * middle, radius)
-
-
-@compiled
-def quantile(ordered: Float, part: float) -> float:
-    """Return the quantile `part`, 0 to 1, of ascending numbers, shape (N,), N at least 1, with linear
-    interpolation."""
-    at = part * (ordered.shape[0] - 1)
-    k = int(at)
-    after = ordered[min(k + 1, ordered.shape[0] - 1)]
-    return float(ordered[k] + (at - k) * (after - ordered[k]))
 
 
 @compiled
@@ -275,7 +266,7 @@ def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
     for i in range(n):
         x, y = _from_axis(rays, i, p)
         angle[i] = np.arctan2(y, x)
-    angle.sort()
+    angle = ascending(angle)
     gap = angle[0] + 2.0 * np.pi - angle[n - 1]
     for i in range(1, n):
         gap = max(gap, angle[i] - angle[i - 1])

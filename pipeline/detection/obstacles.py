@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from pipeline.config.stages import Obstacles
+from pipeline.geometry.ordering import ascending
 from pipeline.ground.scan_ground import Terrain, ground_at
 from pipeline.jit import compiled
 from pipeline.types.records import Clearance, Float, Float32, Zone
@@ -221,7 +222,7 @@ def _nearest(values: Float, least: int) -> float:
 
     Fewer returns, such as rain or an insect, are not an obstacle.
     """
-    ordered = np.sort(values)
+    ordered = ascending(values)
     for i in range(ordered.shape[0] - least + 1):
         if ordered[i + least - 1] - ordered[i] <= DEPTH:
             return float(ordered[i])

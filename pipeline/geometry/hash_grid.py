@@ -194,7 +194,8 @@ def group_rows(label: Int | Int32, groups: int) -> tuple[Int, Int]:
     for k in label:
         if k >= 0:
             bounds[k + 1] += 1
-    bounds = np.cumsum(bounds)
+    for k in range(groups):
+        bounds[k + 1] += bounds[k]
     place = bounds[:-1].copy()
     order = np.empty(bounds[groups], np.int64)
     for i in range(label.shape[0]):

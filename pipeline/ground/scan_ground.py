@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.config.stages import Ground
 from pipeline.geometry.azimuth_bins import direction_turn
+from pipeline.geometry.ordering import median
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int32
@@ -265,7 +266,9 @@ def lowest_returns(points: Float32) -> tuple[Int32, Float]:
             c = s * RINGS + k
             if row[c, 0] >= 0:
                 ghost = bottom[c, 0] + GHOST < bottom[c, 1] < np.inf
-                lowest[s, k] = points[row[c, 1] if ghost else row[c, 0]]
+                i = row[c, 1] if ghost else row[c, 0]
+                for a in range(3):
+                    lowest[s, k, a] = points[i, a]
     return cell, lowest
 
 
@@ -425,17 +428,19 @@ def trend(lowest: Float, slope: float) -> Float:
         Height at the origin [m] and slopes along x and y, shape (3,); zeros if there are no candidates.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
-    rows = np.empty((sectors * rings, 3))
+    rows, height = np.empty((sectors * rings, 3)), np.empty(sectors * rings)
     n = 0
     for s in range(sectors):
         for k in range(rings):
             if lowest[s, k, Z] < np.inf:
-                rows[n] = lowest[s, k]
+                for a in range(3):
+                    rows[n, a] = lowest[s, k, a]
+                height[n] = rows[n, Z]
                 n += 1
     plane: Float = np.zeros(3)
     if n == 0:
         return plane
-    plane[0] = np.median(rows[:n, Z])
+    plane[0] = median(height[:n])
     for _ in range(TREND_ROUNDS):
         A, b = np.zeros((3, 3)), np.zeros(3)
         A[1, 1] = A[2, 2] = LEVEL
@@ -454,7 +459,9 @@ def trend(lowest: Float, slope: float) -> Float:
             b[1] += w * x * z
             b[2] += w * y * z
         A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
-        plane[:] = np.linalg.solve(A, b)
+        solution = np.linalg.solve(A, b)
+        for a in range(3):
+            plane[a] = solution[a]
     steep = np.sqrt(plane[1] ** 2 + plane[2] ** 2)
     if steep > slope:
         plane[1] *= slope / steep

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.config.stages import Relocalisation
+from pipeline.geometry.ordering import ascending_rows
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.jit import compiled
 from pipeline.slam.places import AGREEING, WINDOW
@@ -44,7 +45,7 @@ def pairs_within(position: Float, shortest: float, longest: float, most: int) ->
         shortest, longest: Bounds of the distance [m].
         most: Maximum number of pairs. Of more pairs the longest are omitted, in whole bins of length.
     """
-    order = np.argsort(position[:, 0], kind="mergesort")
+    order = ascending_rows(position[:, 0].copy())
     bins = np.zeros(BINS, np.int64)
     nothing, no_length = np.empty((0, 2), np.int32), np.empty(0)
     _walk_pairs(position, order, shortest, longest, bins, BINS, nothing, no_length)
@@ -55,7 +56,7 @@ def pairs_within(position: Float, shortest: float, longest: float, most: int) ->
     row, length = np.empty((total, 2), np.int32), np.empty(total)
     bins[:] = 0
     _walk_pairs(position, order, shortest, longest, bins, taken, row, length)
-    by_length = np.argsort(length, kind="mergesort")
+    by_length = ascending_rows(length)
     return row[by_length], length[by_length]
 
 
@@ -197,7 +198,7 @@ def search(
         mx, my = 0.5 * (local[i, 0] + local[j, 0]), 0.5 * (local[i, 1] + local[j, 1])
         distance2 = (local[:, 0] - mx) ** 2 + (local[:, 1] - my) ** 2
         distance2[i] = distance2[j] = -1.0  # the pair comes first
-        by_distance = np.argsort(distance2, kind="mergesort")
+        by_distance = ascending_rows(distance2)
         variance = local_sigma[i] ** 2 + local_sigma[j] ** 2 + 2.0 * slack * slack
         widest = 3.0 * np.sqrt(variance + 2.0 * sigma.max() ** 2)
         at = np.searchsorted(length, span - widest)

@@ -426,7 +426,7 @@ def meet_solid(kind: int, shape: Float, surface: Float, o: Float, d: Float, chan
     if kind == STEM:
         return meet_stem(shape, surface, o, d)
     if kind == CONE:
-        return meet_cone(shape, o, d)
+        return meet_cone(shape, o, d, 1.0)
     if kind == BOX:
         return meet_box(shape, o, d)
     enter, leave = meet_ellipsoid(shape, o, d)

@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.geometry.gaussian import in_map, rows_of
 from pipeline.geometry.hash_grid import Cells, cell_of, cells_for, fill, first_of_four, per_metre
+from pipeline.geometry.ordering import ascending_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
 from pipeline.slam.particle_update import SCORE_MAX
@@ -98,7 +99,7 @@ def associate(
         for k in range(n):
             pairs.cost[k] = pairs.squared[k] + np.log(pairs.cost[k])
     taken = np.zeros(mean.shape[0], np.bool_)
-    for k in np.arange(n) if clear else np.argsort(pairs.cost[:n], kind="mergesort"):
+    for k in np.arange(n) if clear else ascending_rows(pairs.cost[:n]):
         d, j = pairs.detection[k], pairs.landmark[k]
         if landmark_of[d] < 0 and not taken[j]:
             landmark_of[d] = j

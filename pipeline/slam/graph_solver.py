@@ -313,7 +313,8 @@ def _add_detections(
         weight = 1.0 / (1.0 + d2)
         Jl[0, 0], Jl[0, 1], Jl[1, 0], Jl[1, 1] = a * c - b * s, a * s + b * c, -d * s, d * c
         Jx[0, 2], Jx[1, 2] = a * h1 - b * h0, -d * h0
-        Jx[:, :2] = -Jl
+        for q in range(2):
+            Jx[0, q], Jx[1, q] = -Jl[0, q], -Jl[1, q]
         for p in range(3):
             normal.g_x[k, p] += weight * (Jx[0, p] * e0 + Jx[1, p] * e1)
             for q in range(3):

@@ -14,6 +14,7 @@ from pipeline.geometry.hash_grid import (
     per_metre,
     put_in,
 )
+from pipeline.geometry.ordering import ascending_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
 from pipeline.tracking.observation import SECTORS, sides_of
@@ -152,7 +153,7 @@ def _best_first(axis: Float, votes: Float, verdict: Int32) -> Int:
         if verdict[c] == TREE:
             rows[n], fewest[n] = c, -votes[c, 0]
             n += 1
-    rows = rows[np.argsort(fewest[:n], kind="mergesort")]
+    rows = rows[ascending_rows(fewest[:n])]
     cells, scale, apart = cells_for(axis.shape[0]), per_metre(ONE_TREE), 0
     for k in range(n):
         c = rows[k]

@@ -287,3 +287,22 @@ def test_kernels_are_compiled_for_that_target(tmp_path):
         check=True,
     )
     assert told.stdout.strip() == "True"
+
+
+CONSTANTS = """
+from pipeline.jit import compiled
+
+@compiled
+def grown(x, by):
+    return x + by
+
+@compiled
+def thrice(x, by):
+    return grown(x, 1) + grown(x, 2) + grown(x, by)
+"""
+
+
+def test_a_kernel_is_compiled_once_for_constant_and_variable_integers(folder):
+    (folder / "wood" / "constants.py").write_text(CONSTANTS)
+    program = "from wood.constants import grown, thrice; print(thrice(0, 3), len(grown.signatures))"
+    assert call(folder, 1.0, 1.0, program) == ["6", "1"]
