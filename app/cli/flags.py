@@ -444,7 +444,7 @@ def compilation_notice() -> Iterator[None]:
     kernel, and then the share of the compiled kernels at intervals of COMPILATION_S."""
     from tqdm import tqdm
 
-    from app.worker.numba_warmup import compiled_share
+    from app.worker.numba_warmup import compiled_kernels
     from pipeline.jit import on_compiling
 
     reported_at: list[float] = []
@@ -452,9 +452,12 @@ def compilation_notice() -> Iterator[None]:
     def report() -> None:
         now, text = time.monotonic(), COMPILING
         if reported_at:
-            if now < reported_at[-1] + COMPILATION_S or (share := compiled_share()) == 1.0:
-                return  # the last kernels are those of one kind of source, which the share does not count
-            text = f"{int(100.0 * share)} % of the kernels are compiled"
+            if now < reported_at[-1] + COMPILATION_S:
+                return
+            compiled, of_all = compiled_kernels()
+            if compiled == of_all:
+                return  # the last kernels are those of one kind of source, which are not counted
+            text = f"{int(100.0 * compiled / of_all)} % of the kernels are compiled"
         reported_at.append(now)
         tqdm.write(text, file=sys.stderr)
         sys.stderr.flush()

@@ -334,6 +334,8 @@ class Dashboard:
                 await self._begin(message)
             case protocol.Shown():
                 await self._show(message)
+            case protocol.Unmapped(run=run, frame=frame) if run == self.run and self.shown is None:
+                self._show_scene(frame, np.zeros((0, 4)))
             case protocol.View(run=run, stamp_ns=stamp_ns, free=free) if run == self.run:
                 self.seen.add(stamp_ns, free)
             case protocol.Answer():

@@ -69,7 +69,7 @@ class WorkerLoop:
         put: Queues a message to the web process; must not block.
         clock: Returns the time [s] from any origin.
         recent: Frames that were sent recently, to which questions refer.
-        compiled_share: Returns the share of the kernels that are compiled, from 0 to 1.
+        kernels: Returns the number of the kernels that are compiled, and of all.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class WorkerLoop:
         put: Put,
         clock: Callable[[], float] = time.monotonic,
         recent: RecentScans | None = None,
-        compiled_share: Callable[[], float] = lambda: 1.0,
+        kernels: Callable[[], tuple[int, int]] = lambda: (1, 1),
     ) -> None:
         self._session = session
         session.on_preview = lambda revision, trees: put(protocol.Rough(self._run, revision, trees))
@@ -96,7 +96,8 @@ class WorkerLoop:
         self._glimpse_at = 0.0
         self._long_way_at = self._quiet_until = 0.0
         self._compiling_since_s, self._compiled_at = 0.0, -math.inf
-        self._compiled_share, self._progress_at = compiled_share, -math.inf
+        self._kernels, self._progress_at = kernels, -math.inf
+        self._prepare_at = 0.0
         self._mapped = 0  # scans since a scan was mapped again
 
     def run(self) -> None:
@@ -226,7 +227,9 @@ class WorkerLoop:
             return None
         if pace == "live":
             return _LISTEN_S if self._guarded(self._session.next_ns) is None else 0.0
-        if pace == "hurry" or not self._prepared:
+        if not self._prepared:
+            return max(0.0, self._prepare_at - self._clock())
+        if pace == "hurry":
             return 0.0
         stamp_ns = self._guarded(self._session.next_ns)
         return 0.0 if stamp_ns is None else self._replay.delay(stamp_ns, self._clock())
@@ -338,18 +341,27 @@ class WorkerLoop:
             self._session.advance(1)
 
     def _prepare(self) -> None:
-        """Compile the kernels for the first scan with `Session.prepare`, and send the status before and
-        after. The run counts as prepared also after an error. Errors of the session pass through."""
+        """Continue the preparation, see `Session.prepare`, and send the status; while kernels are compiled,
+        show the next scan as points or clusters, one in each interval of _GLIMPSE_S. The run counts as
+        prepared also after an error. Errors of the session pass through."""
         self._send_status(self._preparing(), self._clock())
         self._prepared = True
-        self._session.prepare()
-        self._replay.release()
-        self._report()
+        if self._session.prepare():
+            self._replay.release()
+            self._report()
+            return
+        frame = self._session.show_unmapped()
+        if frame is not None:
+            self._put(protocol.Unmapped(self._run, frame))
+        self._prepared = False
+        self._prepare_at = self._clock() + _GLIMPSE_S
 
     def _preparing(self) -> protocol.Status:
         """Return the status of the session with the state "starting", for the time while the mapper is
-        prepared."""
-        return replace(self._session.status(), state="starting", detail="Preparing the mapper")
+        prepared; also with the progress of a compilation that was reported within the last _HEARTBEAT_S."""
+        status = replace(self._session.status(), state="starting", detail="Preparing the mapper")
+        is_compiling = self._clock() < self._compiled_at + _HEARTBEAT_S
+        return self._with_compilation(status) if is_compiling else status
 
     def compiling(self) -> None:
         """Report that the mapping waits for the compilation of a kernel; called during the compilation. The
@@ -367,16 +379,22 @@ class WorkerLoop:
             return
         self._progress_at = now
         # The last status, because the session is in the middle of its work.
-        status = replace(
-            self._reported[0],
-            detail=_COMPILING,
-            compiling_since_s=self._compiling_since_s,
-            compiled=self._compiled_share(),
-        )
+        status = self._with_compilation(self._reported[0])
         if status.state == "playing":
             status = replace(status, state="waiting")
         self._reported = (status, -math.inf)  # so that the next status is sent at once
         self._put(protocol.Report(status))
+
+    def _with_compilation(self, status: protocol.Status) -> protocol.Status:
+        """Return a status with the progress of the compilation."""
+        compiled, of_all = self._kernels()
+        return replace(
+            status,
+            detail=_COMPILING,
+            compiling_since_s=self._compiling_since_s,
+            compiled=compiled / of_all,
+            kernels_left=of_all - compiled,
+        )
 
     @property
     def _is_compiling_reported(self) -> bool:

@@ -1,8 +1,9 @@
 """Compilation of the kernels of the mapper before the first scan.
 
-Two processes compile them: `python -m app.worker.numba_warmup map_scene` maps a scene and begins with the
-front end, while `... warm_tree_map` compiles SLAM and the filters of the trees, which the first one then
-finds in the cache. `python -m app.worker.numba_warmup` runs both and waits for them.
+Two processes compile them: `python -m app.worker.numba_warmup map_scans` maps scans and begins with the front
+end, while `... map_stems` compiles SLAM and the filters of the trees, which the first one then finds in the
+cache. What the first scan of a run needs comes first in both. `python -m app.worker.numba_warmup` runs both
+and waits for them, then compiles the simulator.
 """
 
 from __future__ import annotations
@@ -18,17 +19,18 @@ import numpy as np
 
 from app.common.child_process import BlockingChildProcess, python_module, run_child
 from app.common.settings import data_folder
-from app.store.forests import mapper_of
+from app.store.forests import kept_forests
 from pipeline.config import Parameters
 
 if TYPE_CHECKING:
-    from pipeline.types.records import Step
+    from pipeline.types.records import Float32, Sensor, Step
 
 #: Longest wait for another process that compiles. Kernels that are compiled until then are cached.
 PATIENCE_S = 1800.0
-_PROGRAMS = ("map_scene", "warm_tree_map")
+#: The first one begins with what takes longest, and what a scan needs first.
+PROGRAMS = ("map_scans", "map_stems")
 _POLL_S = 0.2
-_KERNELS = 252  # that both programs compile; only the displayed progress depends on it
+_KERNELS = 230  # that both programs compile; only the displayed progress depends on it
 
 
 def compile_ahead() -> None:
@@ -41,11 +43,24 @@ def compile_ahead() -> None:
     Raises:
         StemmapError: A process cannot be started.
     """
-    if _cores() < len(_PROGRAMS) or is_compiled():
+    for _ in compiling():
+        time.sleep(_POLL_S)
+
+
+def compiling() -> Iterator[bool]:
+    """Compile as `compile_ahead`, and yield until all kernels are there whether those of the front end are.
+    The processes end when the iterator is closed. The functions of `on_compiling` are called before each
+    yield.
+
+    The second process starts at the second step, so that the caller can compile the kernels of its source in
+    the first one on its own core.
+    """
+    if _cores() < len(PROGRAMS) or is_compiled():
         return
-    with _one_at_a_time():
+    with contextlib.ExitStack() as stack:
+        yield from _lock(stack)
         if not is_compiled():  # another process may have compiled them meanwhile
-            _compile()
+            yield from _compile(stack)
 
 
 def is_compiled() -> bool:
@@ -58,12 +73,21 @@ def is_compiled() -> bool:
     return is_kept(grouped) and is_kept(classify_new)
 
 
-def compiled_share() -> float:
-    """Return the share of the kernels of both programs that are cached for the current sources, 0 to 1. It is
-    an estimate: the number of cached kernels divided by `_KERNELS`."""
+def is_front_end_compiled() -> bool:
+    """Return whether the kernels of the front end are cached for the current sources, by the kernel that it
+    calls last."""
+    from pipeline.classification import depth_image
+    from pipeline.jit import is_kept
+
+    return is_kept(depth_image)
+
+
+def compiled_kernels() -> tuple[int, int]:
+    """Return how many kernels of both programs are cached for the current sources, and how many there are.
+    Both are estimates: other kernels that are cached are counted up to `_KERNELS`."""
     from pipeline.jit import count_kept
 
-    return min(1.0, count_kept() / _KERNELS)
+    return min(_KERNELS, count_kept()), _KERNELS
 
 
 def _cores() -> int:
@@ -76,78 +100,131 @@ def _start(program: str) -> BlockingChildProcess:
     return BlockingChildProcess(python_module("app.worker.numba_warmup", program))
 
 
-def _compile() -> None:
-    """Run both programs in processes of their own and wait for them, at most PATIENCE_S; then they are ended.
-    Their errors are ignored. The functions of `on_compiling` are called meanwhile."""
-    from pipeline.jit import others_compile
+def _compile(stack: contextlib.ExitStack) -> Iterator[bool]:
+    """Run both programs in processes of their own, and yield as `compiling` until they end, at most
+    PATIENCE_S. Their errors are ignored.
 
-    with contextlib.ExitStack() as stack:
-        children = []
-        for program in _PROGRAMS:
-            children.append(_start(program))
-            stack.callback(children[-1].end)
-        until_s = time.monotonic() + PATIENCE_S
-        while any(child.returncode is None for child in children) and time.monotonic() < until_s:
-            others_compile()
-            time.sleep(_POLL_S)
-
-
-@contextlib.contextmanager
-def _one_at_a_time() -> Iterator[None]:
-    """Hold the lock with which only one process of a user compiles at a time; the next one then finds the
-    cache.
-
-    A process that waited for PATIENCE_S continues without the lock. Without a folder for the lock, or without
-    file locks on this system, no process waits.
+    Args:
+        stack: Ends the processes.
     """
     from pipeline.jit import others_compile
 
-    until_s = time.monotonic() + PATIENCE_S
-    with contextlib.ExitStack() as stack:
-        folder = data_folder(os.environ)
-        with contextlib.suppress(ImportError, OSError):
-            import fcntl
-
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-                lock = stack.enter_context((folder / "compiling.lock").open("a"))
-                while time.monotonic() < until_s:
-                    with contextlib.suppress(BlockingIOError):
-                        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                        break
-                    others_compile()
-                    time.sleep(_POLL_S)
-        yield
+    children, until_s = list[BlockingChildProcess](), time.monotonic() + PATIENCE_S
+    while len(children) < len(PROGRAMS) or any(child.returncode is None for child in children):
+        if len(children) < len(PROGRAMS):
+            children.append(_start(PROGRAMS[len(children)]))
+            stack.callback(children[-1].end)
+        if time.monotonic() > until_s:
+            return
+        others_compile()
+        yield is_front_end_compiled()
 
 
-_SCENE = "sim:stand?duration=1"
+def _lock(stack: contextlib.ExitStack) -> Iterator[bool]:
+    """Take the lock with which only one process of a user compiles at a time; the next one then finds the
+    cache. Yield as `compiling` while another process holds it.
+
+    A process that waited for PATIENCE_S continues without the lock. Without a folder for the lock, or without
+    file locks on this system, no process waits.
+
+    Args:
+        stack: Releases the lock.
+    """
+    from pipeline.jit import others_compile
+
+    folder, until_s = data_folder(os.environ), time.monotonic() + PATIENCE_S
+    with contextlib.suppress(ImportError, OSError):
+        import fcntl
+
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context((folder / "compiling.lock").open("a"))
+            while time.monotonic() < until_s:
+                with contextlib.suppress(BlockingIOError):
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    return
+                others_compile()
+                yield is_front_end_compiled()
 
 
 def warm_up() -> None:
     """Compile or load all kernels of the mapper. The first time on a machine this takes minutes. Errors as
     `compile_ahead`."""
     compile_ahead()
-    map_scene()
+    map_scans()
 
 
-def map_scene() -> None:
-    """Compile or load all kernels by mapping one second of a simulated stand in this process, with a step
-    back and a preview."""
-    from pipeline.io.readers import open_source
-    from pipeline.odometry.synchroniser import steps
+def map_scans() -> None:
+    """Compile or load all kernels of the mapper by mapping ten scans in this process, with a step back and a
+    preview."""
+    from pipeline.geometry.poses import Pose2, Pose3
+    from pipeline.mapper import Mapper
     from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees
+    from pipeline.types.records import Scan, Step
 
-    source, parameters, clusters, columns = open_source(_SCENE), Parameters(), ClusterTable(), None
-    mapper = mapper_of(source.description, parameters, seed=0)
-    for step in steps(source.records()):
-        frame = mapper.process(step)
+    parameters, clusters, columns = Parameters(), ClusterTable(), None
+    T_base_lidar = Pose3.from_euler(np.array([0.0, 0.0, _SENSOR_Z]), 0.0, 0.0, 0.0)
+    mapper = Mapper(parameters, sensor=_sensor(), T_base_lidar=T_base_lidar, seed=0, forests=kept_forests())
+    for index in range(10):
+        along, at_ns = 0.1 * index, 100_000_000 * index
+        frame = mapper.process(
+            Step(
+                index,
+                Scan(at_ns, _returns(along)),
+                Pose2(along, 0.0, 0.0),
+                twist=(1.0, 0.0, 0.0),
+                elapsed_ns=at_ns,
+                period_ns=min(at_ns, 100_000_000),
+            )
+        )
         clusters.record(frame)
         columns = frame.columns
     mapper.snapshot().gathering.folded()  # as a step back does
     preview_trees(KnownMap(parameters, clusters, mapper.path, columns), parameters)
 
 
-def warm_tree_map() -> None:
+_SENSOR_Z = 1.0  # m; height of the sensor above the ground
+_SPACING, _RADIUS, _NOISE = 2.5, 0.15, 0.01  # m; distance of the stems, their radius, noise of a range
+
+
+def _returns(along: float) -> Float32:
+    """Return a scan of 16 rings between stems on level ground, shape (N, 3) [m] in the frame of the sensor,
+    made without kernels.
+
+    Args:
+        along: Position of the sensor along x [m].
+    """
+    azimuth, elevation = np.meshgrid(
+        np.linspace(-np.pi, np.pi, 1800, endpoint=False), np.radians(np.linspace(-15.0, 15.0, 16))
+    )
+    level = np.cos(elevation)
+    d = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]).reshape(3, -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        nearest = np.where(d[2] < 0.0, -_SENSOR_Z / d[2], np.inf)
+        for x in np.arange(-4.0, 5.0) * _SPACING + 0.5 * _SPACING - along:
+            for y in np.array([-1.5, -0.5, 0.5, 1.5]) * _SPACING:
+                a, b = d[0] ** 2 + d[1] ** 2, d[0] * x + d[1] * y
+                root = np.sqrt(b * b - a * (x * x + y * y - _RADIUS * _RADIUS))
+                nearest = np.fmin(nearest, np.where(b > root, (b - root) / a, np.inf))
+    nearest += np.random.default_rng(0).normal(0.0, _NOISE, nearest.shape)
+    seen = nearest < 30.0
+    return np.ascontiguousarray((d[:, seen] * nearest[seen]).T, np.float32)
+
+
+def _sensor() -> Sensor:
+    """Return a sensor of 16 rings, 2 degrees apart, with 1,800 shots in each."""
+    from pipeline.types.records import Sensor
+
+    return Sensor(
+        name="VLP-16",
+        rings=16,
+        ring_step=float(np.radians(2.0)),
+        azimuth_step=2.0 * np.pi / 1800,
+        range_sigma=_NOISE,
+    )
+
+
+def map_stems() -> None:
     """Compile the kernels of SLAM, of the Kalman filters of the trees and of the preview, by mapping
     simulated stems."""
     from pipeline.classification import no_columns
@@ -187,9 +264,18 @@ def _stems() -> Iterator[Step]:
         yield Step(index, scan, Pose2(along, 0.0, 0.0))
 
 
+def simulate() -> None:
+    """Compile or load the kernels of the simulator, by a second of a simulated stand."""
+    from pipeline.io.readers import open_source
+
+    for _ in open_source("sim:stand?duration=1").records():
+        pass
+
+
 if __name__ == "__main__":
-    _programs = {"warm_up": warm_up, "map_scene": map_scene, "warm_tree_map": warm_tree_map}
+    _programs = {"warm_up": warm_up, "map_scans": map_scans, "map_stems": map_stems}
     if sys.argv[1:]:
         run_child(lambda _: _programs[sys.argv[1]]())
     warm_up()
-    warm_tree_map()
+    map_stems()
+    simulate()

@@ -12,7 +12,7 @@ from typing import BinaryIO
 import numpy as np
 from msgspec import structs
 
-from app.worker.protocol import FromWorker, Opened, Report, Shown, WireError, from_worker
+from app.worker.protocol import FromWorker, Opened, Report, Shown, Unmapped, WireError, from_worker
 from pipeline.geometry.columns import evenly_spaced, rows_in_common, rows_of
 from pipeline.types.records import Frame, HeightMap, Path
 
@@ -114,6 +114,8 @@ class Outbox:
             self._sent_at = time.monotonic()
             self._recent.keep(message.run, message.frame)
             return self._with_new_path_only(message)
+        if isinstance(message, Unmapped):
+            return structs.replace(message, frame=picture_of(message.frame))
         if isinstance(message, Opened):
             self._refused = ""
         elif isinstance(message, Report):

@@ -35,13 +35,13 @@ def new_session() -> Session:
     """Return a session that uses the real pipeline, for the worker and for commands that map in this
     process."""
     from app.store.forests import mapper_of
-    from app.worker.numba_warmup import compile_ahead, warm_up
+    from app.worker.numba_warmup import compiling, warm_up
 
     return Session(
         open_source=open_any_or_one_step,
         make_mapper=mapper_of,
         parameters=Parameters(),
-        compile_ahead=compile_ahead,
+        compiling=compiling,
         warm_up=warm_up,
     )
 
@@ -68,7 +68,7 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
         incoming: Stream of encoded commands.
         outgoing: Stream for encoded messages.
     """
-    from app.worker.numba_warmup import compiled_share
+    from app.worker.numba_warmup import compiled_kernels
 
     commands: queue.Queue[ToWorker | None] = queue.Queue()
     finished = threading.Event()
@@ -76,7 +76,7 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
     reader.start()
     recent = RecentScans()
     mailbox = Outbox(outgoing, recent)
-    driver = WorkerLoop(session, commands, mailbox.put, recent=recent, compiled_share=compiled_share)
+    driver = WorkerLoop(session, commands, mailbox.put, recent=recent, kernels=compiled_kernels)
     with on_compiling(_notify_compilation), on_compiling(driver.compiling):
         driver.run()
     mailbox.close()

@@ -61,6 +61,8 @@ class Status:
         robots: Namespaces of all robots on the network that publish scans.
         compiling_since_s: Start of the present compilation of kernels [s since 1970], None if there is none.
         compiled: Share of the kernels that are compiled, from 0 to 1; None if there is no compilation.
+        kernels_left: Number of kernels that are not compiled yet; None if there is no compilation.
+        unmapped: Number of scans that were shown as points before the mapper was ready.
         remapped: Share of the run that is mapped again (see `SetParameters`), from 0 to 1; None if there is
             no rerun.
         camera: Whether the source has camera pictures.
@@ -99,6 +101,8 @@ class Status:
     compiling_since_s: float | None = None
     one_step: OneStep | None = None
     compiled: float | None = None
+    kernels_left: int | None = None
+    unmapped: int = 0
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):
@@ -491,7 +495,19 @@ class View(msgspec.Struct, frozen=True, tag="view"):
     free: Float
 
 
-FromWorker = Opened | Shown | Report | Answer | Remapped | Rough | View
+class Unmapped(msgspec.Struct, frozen=True, tag="unmapped"):
+    """A scan that is shown before the mapper is ready, see `unmapped_frame`. It belongs to no map.
+
+    Attributes:
+        run: As in `Shown`.
+        frame: Points of the scan, and its clusters once the front end is compiled.
+    """
+
+    run: int
+    frame: Frame
+
+
+FromWorker = Opened | Shown | Report | Answer | Remapped | Rough | View | Unmapped
 Question = AskCluster | AskTree | AskCompare | AskCamera | AskTreePicture | AskSection | AskCourse
 ToWorker = Command | Begin | SetRepairs | Question
 

@@ -27,6 +27,7 @@ from app.worker.remap import (
     segment_ahead,
 )
 from app.worker.tree_numbers import TreeNumbers
+from app.worker.unmapped import unmapped_frame
 from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
 from pipeline.config.model import validated
@@ -438,6 +439,26 @@ class Run:
         """Return the parameters with which the scan with this index (0 or more) was or will be mapped."""
         return self._map.parameters.at(index)
 
+    def next_unmapped(self, *, segmented: bool) -> Frame | None:
+        """Return the next scan of a run that is not mapped yet, see `unmapped_frame`; the next call returns
+        the scan after it. None for a live run and at the end of the run. `prepare` returns to the first scan.
+
+        Args:
+            segmented: Whether the frame has clusters, for which the front end must be compiled.
+
+        Raises:
+            SourceError: Nothing more can be read.
+            StemmapError: The scan cannot be segmented.
+        """
+        step = None if self._is_live else self._cursor.take()
+        if step is None:
+            return None
+        mapper = self._map.mapper
+        mapper.parameters = self._map.parameters.at(step.index)
+        with self.stopwatch.aside():
+            scan = mapper.segment(step) if segmented else None
+        return unmapped_frame(step, self.source.description.T_base_lidar, scan)
+
     def prepare(self) -> None:
         """Map the next scan, the first of a new run, with its parameters, and discard the result and the
         measured times, so that all kernels are compiled.
@@ -446,6 +467,8 @@ class Run:
             SourceError: There is no scan, or it cannot be read.
             StemmapError: The scan cannot be mapped.
         """
+        if self._cursor.known:  # scans were shown meanwhile, see `next_unmapped`
+            self._cursor.go_to(0)
         step = self._cursor.peek()
         if step is None:
             uri = self.source.description.uri

@@ -6,7 +6,7 @@ It has no thread, socket or clock; the loop of the worker reads `pace` and calls
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Literal
@@ -62,12 +62,14 @@ class Session:
         open_source: Opens a source by its URI and options.
         make_mapper: Returns a new mapper.
         parameters: Parameters at the beginning.
-        compile_ahead: Compiles the kernels that are not compiled on this machine yet.
+        compiling: Compiles the kernels that are not compiled on this machine yet, in other processes; yields
+            whether those of the front end are there until all are.
         warm_up: Loads the kernels; called while a robot is already received and recorded.
 
     Attributes:
         on_preview: Called by `remap` with the revision of the parameters and the preview trees of a rerun,
             before any scan is mapped again.
+        unmapped: Number of scans of the run that `show_unmapped` returned.
     """
 
     def __init__(
@@ -75,12 +77,13 @@ class Session:
         open_source: OpenSource,
         make_mapper: MakeMapper,
         parameters: Parameters,
-        compile_ahead: Callable[[], None] = lambda: None,
+        compiling: Callable[[], Iterator[bool]] = lambda: iter(()),
         warm_up: Callable[[], None] = lambda: None,
     ) -> None:
         self._open_source = open_source
         self._warm_up = warm_up
-        self._compile_ahead = compile_ahead
+        self._compile, self._compiling, self._is_segmenting = compiling, compiling(), False
+        self.unmapped = 0
         self._make_mapper = make_mapper
         self._parameters = parameters
         self._revision = 0
@@ -275,21 +278,39 @@ class Session:
             source.close()
             raise
         self._run, self._state, self._detail = run, "paused", ""
+        self.unmapped = 0
+        if isinstance(run, Run):
+            self._is_segmenting = next(self._compiling, False)
         self._warn(run.warnings)
         return opened_of(run)
 
-    def prepare(self) -> None:
-        """Compile the kernels by mapping the first scan, whose result is discarded. It can take minutes the
-        first time on a machine. Nothing without a run, and for one of one step.
+    def prepare(self) -> bool:
+        """Continue the preparation of the run and return whether it is complete: the kernels are compiled in
+        other processes, which can take minutes the first time on a machine, then the first scan is mapped,
+        whose result is discarded. Nothing is left to do without a run, and for one of one step.
 
         Raises:
             SourceError: There is no scan, or it cannot be read.
             StemmapError: The scan cannot be mapped, or a process that compiles cannot be started.
         """
         if isinstance(self._run, Run):
-            self._compile_ahead()
+            has_front_end = next(self._compiling, None)
+            if has_front_end is not None:
+                self._is_segmenting = has_front_end
+                return False
+            self._compiling = self._compile()  # for the next run, whose kernels may be others
             self._run.prepare()
             stories.warm_up(self._run.source.description.sensor)
+        return True
+
+    def show_unmapped(self) -> Frame | None:
+        """Return the next scan of a run that waits for its kernels, see `Run.next_unmapped`, and count it in
+        `unmapped`; None without one. Errors as there."""
+        if not isinstance(self._run, Run):
+            return None
+        frame = self._run.next_unmapped(segmented=self._is_segmenting)
+        self.unmapped += frame is not None
+        return frame
 
     def disturb(self) -> None:
         """Discard the time measurement of the scan that is mapped now, since the mapping waits for something
@@ -498,6 +519,7 @@ class Session:
             revision=self._revision,
             going_to="" if self.is_shown else self._target.words(run),
             going_to_s=None if self.is_shown else self._target.time_s(run),
+            unmapped=self.unmapped,
         )
         status = status if run is None else _with_run(status, run, self.frame, self.path)
         return status if robot is None else with_robot(status, robot)

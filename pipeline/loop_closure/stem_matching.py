@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.ordering import ascending_rows
@@ -334,6 +333,8 @@ def crowding(pose: Float, local: Float, reference: Float, window: float) -> tupl
         local, reference: Stems, shapes (L, 2) and (N, 2) [m], L > 0.
         window: Radius [m].
     """
+    from scipy.spatial import cKDTree
+
     c, s = np.cos(pose[2]), np.sin(pose[2])
     place = local @ np.array([[c, s], [-s, c]]) + pose[:2]
     near = cKDTree(reference).query_ball_point(place, window, return_length=True)

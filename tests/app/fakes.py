@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import cast
 from zlib import crc32
@@ -247,8 +247,13 @@ def truth_trees() -> TruthTrees:
     )
 
 
-def make_session(source: FakeSource, parameters: Parameters | None = None) -> Session:
-    """A session on a fake source (opened again and again) with fake mappers."""
+def make_session(
+    source: FakeSource,
+    parameters: Parameters | None = None,
+    compiling: Callable[[], Iterator[bool]] = lambda: iter(()),
+) -> Session:
+    """A session on a fake source (opened again and again) with fake mappers, and a compilation of any
+    length."""
 
     def open_source(uri: str, _options: SourceOptions) -> Source:
         if uri == "missing:":
@@ -261,6 +266,7 @@ def make_session(source: FakeSource, parameters: Parameters | None = None) -> Se
         open_source=open_source,
         make_mapper=make_mapper,
         parameters=parameters or Parameters(),
+        compiling=compiling,
     )
 
 

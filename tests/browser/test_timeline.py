@@ -123,10 +123,11 @@ def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: 
         "detail": "Compiling",
         "compiling_since_s": time.time() - 100.0,
         "compiled": 0.437,
+        "kernels_left": 135,
     }
     word, notice, _, seeking = page.evaluate(UNDER, compiling)
     assert (word, seeking) == ("Waiting", "")
-    passed = re.search(r"Compiling\. 43 % done after (\d+) s\.", notice)
+    passed = re.search(r"Compiling\. 43 % done after (\d+) s, 135 kernels left, about 2 min\.", notice)
     assert passed is not None, notice
     assert int(passed[1]) >= 98, "from its start, not from the opening of the page"
     expect(page.locator("#state b")).to_have_text("Paused")

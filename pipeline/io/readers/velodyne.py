@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-import velodyne_decoder
 from numpy.typing import NDArray
 
 from pipeline.io.readers.scan_columns import clean_scan
 from pipeline.types.records import Scan, Sensor
+
+if TYPE_CHECKING:
+    import velodyne_decoder
 
 PACKET_BYTES = 1206
 PRODUCT = 1205
@@ -110,6 +113,8 @@ class PacketDecoder:
             PacketError: There are no packets, the numbers of stamps and packets differ, or the decoder
                 refuses the packets.
         """
+        import velodyne_decoder
+
         if not packets:
             raise PacketError("no packets")
         vector = velodyne_decoder.PacketVector()
@@ -123,6 +128,8 @@ class PacketDecoder:
 
     def _decoder_of(self, product: int) -> velodyne_decoder.ScanDecoder:
         """Return the decoder of a product number; it finds the model itself, except for VLP-32."""
+        import velodyne_decoder
+
         if product not in self._decoders:
             model = velodyne_decoder.Model.VLP32B if product == VLP_32 else None
             self._decoders[product] = velodyne_decoder.ScanDecoder(velodyne_decoder.Config(model=model))

@@ -184,15 +184,19 @@ function showWay() {
 let ahead = null; // [ms] of the server's clock before that of this machine; null while unknown
 let compiledAt = -Infinity; // when the server last reported compiling [ms]
 
-function compilingFor({ compiling_since_s: since, compiled }) {
+function compilingFor({ compiling_since_s: since, compiled, kernels_left: left }) {
   if (!since) return "";
   compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
-  const done = compiled < 1 ? `. ${Math.floor(100 * compiled)} % done` : "";
-  if (passed < 10) return done && `${done}.`;
-  return done ? `${done} after ${passed} s.` : `. ${passed} s so far.`;
+  if (!(compiled < 1)) return passed < 10 ? "" : `. ${passed} s so far.`;
+  const percent = Math.floor(100 * compiled), kernels = left ? `, ${left} ${left === 1 ? "kernel" : "kernels"} left` : "";
+  if (passed < 10 || !percent) return `. ${percent} % done${kernels}.`;
+  return `. ${percent} % done after ${passed} s${kernels}, about ${roughly((passed * (1 - compiled)) / compiled)}.`;
 }
+
+// A duration [s] as precisely as an estimate of it is: in tens of seconds, or in minutes.
+const roughly = (s) => (s < 90 ? `${10 * Math.max(1, Math.round(s / 10))} s` : `${Math.round(s / 60)} min`);
 
 // The changing part of the notice, which a screen reader does not announce.
 function progressOf(status) {

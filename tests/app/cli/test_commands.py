@@ -53,11 +53,11 @@ def test_an_option_that_is_mistyped_is_named(capsys):
 
 def test_compilation_is_reported_once_and_then_its_progress(capsys, monkeypatch):
     monkeypatch.setattr("pipeline.jit.on_compiling", on_compiling)  # which tests/conftest.py replaces
-    now, share = [0.0], [0.25]
+    now, compiled = [0.0], [0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
-    monkeypatch.setattr("app.worker.numba_warmup.compiled_share", lambda: share[0])
+    monkeypatch.setattr("app.worker.numba_warmup.compiled_kernels", lambda: (compiled[0], 200))
     with flags.compilation_notice():
-        for now[0], share[0] in ((0.0, 0.1), (9.0, 0.2), (10.0, 0.25), (15.0, 0.3), (20.0, 1.0)):
+        for now[0], compiled[0] in ((0.0, 20), (9.0, 40), (10.0, 50), (15.0, 60), (20.0, 200)):
             others_compile()
     assert capsys.readouterr().err.splitlines() == [COMPILING, "25 % of the kernels are compiled"]
 

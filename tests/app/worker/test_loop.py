@@ -37,6 +37,7 @@ from app.worker.protocol import (
     State,
     Status,
     ToWorker,
+    Unmapped,
     from_worker,
 )
 from pipeline.config import Parameters
@@ -116,19 +117,44 @@ def test_compilation_is_reported_with_its_progress_and_no_silence_follows() -> N
     clock = itertools.count(
         step=0.6
     ).__next__  # the second of three calls comes within the second of the first
-    driver = WorkerLoop(session, commands, put, clock, compiled_share=iter([0.25, 0.75]).__next__)
+    driver = WorkerLoop(session, commands, put, clock, kernels=iter([(60, 240), (180, 240)]).__next__)
     for command in (Open("fake:"), SetSpeed(0.0), Play()):
         commands.put(command)
     driver.run()
     reports = [m.status for m in said if isinstance(m, Report)]
     waiting = [status for status in reports if status.state == "waiting"]
     assert [status.compiled for status in waiting] == [0.25, 0.75]
+    assert [status.kernels_left for status in waiting] == [180, 60]
     for status in waiting:
         assert (status.detail, status.source) == (COMPILING.capitalize(), "fake:")
         assert time.time() - 60.0 < (status.compiling_since_s or 0.0) <= time.time()
     after = reports[reports.index(waiting[-1]) + 1]
     assert (after.compiling_since_s, after.compiled) == (None, None)
     assert (after.state, after.detail) == ("playing", "")
+
+
+def test_points_and_the_time_line_are_there_before_the_kernels() -> None:
+    session, said = make_session(FakeSource(9), compiling=lambda: iter([False] * 4)), list[FromWorker]()
+    commands: queue.Queue[ToWorker | None] = queue.Queue()
+
+    def put(message: FromWorker) -> None:
+        said.append(message)
+        if isinstance(message, Report) and message.status.state == "finished":
+            commands.put(None)
+
+    driver = WorkerLoop(session, commands, put, itertools.count(step=0.3).__next__)
+    for command in (Open("fake:"), SetSpeed(0.0), Play()):
+        commands.put(command)
+    driver.run()
+    points = [message for message in said if isinstance(message, Unmapped)]
+    assert [(message.run, message.frame.index) for message in points] == [(1, 0), (1, 1), (1, 2)]
+    assert all(len(message.frame.raw) for message in points)
+    before = said[: next(k for k, message in enumerate(said) if isinstance(message, Shown))]
+    assert all(message in before for message in points)
+    reports = [message.status for message in before if isinstance(message, Report)]
+    waiting = [status for status in reports if status.unmapped == 3 and status.state == "starting"]
+    assert {(status.scans, status.end_s, status.scan_index) for status in waiting} == {(9, 0.8, -1)}
+    assert shown(said)[0] == 0  # mapping begins with the first scan all the same
 
 
 def test_an_answer_that_compiled_leaves_nothing_to_wait_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""How long a person waits: for the help, and for the first scan on the dashboard."""
+"""How long a person waits: for the help, and for points, a scan and trees on the dashboard."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from types import MappingProxyType
-from typing import IO
+from typing import IO, Any
 from urllib.parse import parse_qs, urlsplit
 
 from pipeline.errors import StemmapError
@@ -27,48 +27,78 @@ from tests.benchmarks.timing import middle
 
 NAME = "start"
 LINE = (
-    "Time of `stemmap --help`, and from a start to the first scan on the dashboard, warm and on a new machine"
+    "Time of `stemmap --help`, and from a start to the link, points, the first scan and trees on the "
+    "dashboard, warm and on a new machine"
 )
 
 ROOT = Path(__file__).resolve().parents[3]
+#: Root of another clone that is measured in place of this one.
+CLONE = "STEMMAP_BENCH_CLONE"
 HELP_S, DASHBOARD_S, NEW_S = 0.5, 10.0, 30.0  # asked for
 HELP_ROUNDS, DASHBOARD_ROUNDS, NEW_ROUNDS = 11, 3, 3
-LONGEST_S = 300.0
-NO_SETTINGS: Mapping[str, str] = MappingProxyType({})
+LONGEST_S = 900.0
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """When something was seen.
+
+    Attributes:
+        s: Time since the command [s].
+        cpu_s: Computing time of all processes of the program until then [s].
+    """
+
+    s: float
+    cpu_s: float
+
+
+#: What a person waits for, in this order, with the words of the table.
+WAITS = {
+    "link": "its link",
+    "points": "points in the scene",
+    "scan": "the first scan",
+    "trees": "the first trees",
+}
 
 
 def run() -> list[Table]:
     """Both, each once before for warmth."""
+    clone = Path(os.environ.get(CLONE, ROOT))
     help_s = [seconds_of_help() for _ in range(HELP_ROUNDS + 1)][1:]
-    rows = [_row("stemmap --help", help_s, HELP_S)]
+    rows = [_row("stemmap --help", help_s, None, HELP_S)]
     notes = ["Whole processes; the first start, which warms the disk's cache, is left out."]
     if find_spec("app.cli.serve") is not None:
-        waits = [seconds_to_link_and_first_scan() for _ in range(DASHBOARD_ROUNDS + 1)][1:]
-        rows.append(_row("stemmap serve sim:stand, to its link", [link for link, _ in waits], None))
-        rows.append(_row("the same, to its first scan", [shown for _, shown in waits], DASHBOARD_S))
+        warm = [moments({"PYTHONPATH": str(clone)}) for _ in range(DASHBOARD_ROUNDS + 1)][1:]
+        new = new_machine(clone)
+        for state, waits, asked_s in (("warm", warm, DASHBOARD_S), ("without compiled kernels", new, NEW_S)):
+            for what, words in WAITS.items():
+                seen = [each[what] for each in waits]
+                asked = asked_s if what == "scan" else None
+                name = f"stemmap serve sim:stand, {state}, to {words}"
+                rows.append(_row(name, [m.s for m in seen], [m.cpu_s for m in seen], asked))
         notes.append(
-            "The first scan is there when /api/status tells of one; a browser's own start is not in it."
+            "By /api/status: points are there when it tells of a scan, mapped or not; "
+            "a browser's own start is not in it."
         )
-        rows.append(_row("the same, without compiled kernels", new_machine(), NEW_S))
         notes.append("Without compiled kernels: as in the first start of a clone.")
-    columns = ("start", "times", "median s", "slowest s", "asked for s", "by the median")
+    columns = ("start", "times", "median s", "slowest s", "median CPU s", "asked for s", "by the median")
     return [Table("Waiting times", columns, tuple(rows), tuple(notes))]
 
 
-def new_machine() -> list[float]:
-    """Seconds to the first scan, each time from a copy of the sources without compiled kernels."""
+def new_machine(clone: Path) -> list[dict[str, Moment]]:
+    """The moments of starts, each from a copy of the sources of a clone without compiled kernels."""
     waits = []
     for _ in range(NEW_ROUNDS):
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as clone:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as copy:
             for name in ("app", "pipeline", "static"):
-                shutil.copytree(ROOT / name, Path(clone) / name, ignore=shutil.ignore_patterns("*.nb[ci]"))
-            waits.append(seconds_to_link_and_first_scan({"PYTHONPATH": clone})[1])
+                shutil.copytree(clone / name, Path(copy) / name, ignore=shutil.ignore_patterns("*.nb[ci]"))
+            waits.append(moments({"PYTHONPATH": copy}))
     return waits
 
 
-def _row(name: str, seconds: list[float], asked: float | None) -> tuple[Cell, ...]:
+def _row(name: str, seconds: list[float], cpu_s: list[float] | None, asked: float | None) -> tuple[Cell, ...]:
     reached = "" if asked is None else verdict(middle(seconds) <= asked)
-    return name, len(seconds), middle(seconds), max(seconds), asked, reached
+    return name, len(seconds), middle(seconds), max(seconds), cpu_s and middle(cpu_s), asked, reached
 
 
 def command(*words: str) -> list[str]:
@@ -85,12 +115,12 @@ def seconds_of_help() -> float:
     return time.perf_counter() - start
 
 
-def seconds_to_link_and_first_scan(settings: Mapping[str, str] = NO_SETTINGS) -> tuple[float, float]:
-    """From nothing to the printed link, and to the first scan in /api/status, with more settings of the
+def moments(settings: Mapping[str, str]) -> dict[str, Moment]:
+    """When the things of WAITS were there after `stemmap serve sim:stand`, with more settings of the
     environment.
 
     Raises:
-        StemmapError: It did not come.
+        StemmapError: They did not come.
     """
     start = time.perf_counter()
     server = subprocess.Popen(
@@ -99,18 +129,46 @@ def seconds_to_link_and_first_scan(settings: Mapping[str, str] = NO_SETTINGS) ->
         text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1", **settings},
     )
+    seen: dict[str, Moment] = {}
+
+    def see(what: str) -> None:
+        if what not in seen:
+            seen[what] = Moment(time.perf_counter() - start, computing_s(server.pid))
+
     try:
         if server.stdout is None:
             raise StemmapError("the dashboard has no pipe")
         link = _first_link(server.stdout, start + LONGEST_S)
-        linked = time.perf_counter() - start
-        while time.perf_counter() < start + LONGEST_S:
-            if server.poll() is None and _scan_index(link) >= 0:
-                return linked, time.perf_counter() - start
+        see("link")
+        while time.perf_counter() < start + LONGEST_S and server.poll() is None:
+            status = _status(link)
+            if status.get("unmapped", 0) > 0 or status.get("scan_index", -1) >= 0:
+                see("points")
+            if status.get("scan_index", -1) >= 0:
+                see("scan")
+            if status.get("trees", 0) > 0:
+                see("trees")
+                return seen
             time.sleep(0.02)
-        raise StemmapError(f"the dashboard showed no scan within {LONGEST_S:g} s")
+        raise StemmapError(f"the dashboard showed no tree within {LONGEST_S:g} s")
     finally:
         _end(server)
+
+
+def computing_s(pid: int) -> float:
+    """Return the computing time [s] of a process and of all that it started, by /proc; 0 without it."""
+    ticks, children = dict[int, int](), dict[int, list[int]]()
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            fields = file.read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+            children.setdefault(int(fields[1]), []).append(int(file.parent.name))
+            ticks[int(file.parent.name)] = sum(map(int, fields[11:15]))  # also of children that have ended
+    total, waiting = 0, [pid]
+    while waiting:
+        each = waiting.pop()
+        total += ticks.get(each, 0)
+        waiting += children.get(each, [])
+    return total / os.sysconf("SC_CLK_TCK") if ticks else 0.0
 
 
 def _first_link(lines: IO[str], until: float) -> str:
@@ -131,7 +189,8 @@ def _read_into(lines: IO[str], read: queue.Queue[str]) -> None:
         read.put(line)
 
 
-def _scan_index(link: str) -> int:
+def _status(link: str) -> dict[str, Any]:
+    """The status of the run; empty while the server does not answer."""
     parts = urlsplit(link)
     token = parse_qs(parts.query)["token"][0]
     request = urllib.request.Request(
@@ -139,11 +198,11 @@ def _scan_index(link: str) -> int:
     )
     try:
         with urllib.request.urlopen(request, timeout=5.0) as reply:  # noqa: S310
-            return int(json.load(reply).get("scan_index", -1))
+            return dict(json.load(reply))
     except urllib.error.HTTPError as error:
         raise StemmapError(f"the dashboard answered {error.code}", where="/api/status") from None
     except OSError:
-        return -1
+        return {}
 
 
 def _end(server: subprocess.Popen[str]) -> None:
