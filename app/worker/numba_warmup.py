@@ -1,9 +1,9 @@
 """Compilation of the kernels of the mapper before the first scan.
 
-Two processes compile them: `python -m app.worker.numba_warmup map_scans` maps scans and begins with the front
-end, while `... map_stems` compiles SLAM and the filters of the trees, which the first one then finds in the
-cache. What the first scan of a run needs comes first in both. `python -m app.worker.numba_warmup` runs both
-and waits for them, then compiles the simulator.
+Two processes compile them: `python -m app.worker.numba_warmup compile_scans` compiles the front end and the
+columns, while `... map_stems` compiles SLAM and the filters of the trees. In both, what the first scan of a
+run needs comes first. `python -m app.worker.numba_warmup` runs both and waits for them, then compiles the
+simulator.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,16 +21,19 @@ from app.common.child_process import BlockingChildProcess, python_module, run_ch
 from app.common.settings import data_folder
 from app.store.forests import kept_forests
 from pipeline.config import Parameters
+from pipeline.geometry.poses import Pose2, Pose3
 
 if TYPE_CHECKING:
-    from pipeline.types.records import Float32, Sensor, Step
+    from pipeline.mapper import Mapper
+    from pipeline.types.records import Float32, Step
 
 #: Longest wait for another process that compiles. Kernels that are compiled until then are cached.
 PATIENCE_S = 1800.0
 #: The first one begins with what takes longest, and what a scan needs first.
-PROGRAMS = ("map_scans", "map_stems")
+PROGRAMS = ("compile_scans", "map_stems")
 _POLL_S = 0.2
-_KERNELS = 230  # that both programs compile; only the displayed progress depends on it
+_OTHER_S = 120.0  # on a quiet machine, the other program ends within a minute
+_KERNELS = 225  # that both programs compile; only the displayed progress depends on it
 
 
 def compile_ahead() -> None:
@@ -47,7 +50,7 @@ def compile_ahead() -> None:
         time.sleep(_POLL_S)
 
 
-def compiling() -> Iterator[bool]:
+def compiling() -> Generator[bool, None, None]:
     """Compile as `compile_ahead`, and yield until all kernels are there whether those of the front end are.
     The processes end when the iterator is closed. The functions of `on_compiling` are called before each
     yield.
@@ -154,35 +157,74 @@ def warm_up() -> None:
     map_scans()
 
 
-def map_scans() -> None:
-    """Compile or load all kernels of the mapper by mapping ten scans in this process, with a step back and a
-    preview."""
-    from pipeline.geometry.poses import Pose2, Pose3
-    from pipeline.mapper import Mapper
-    from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees
-    from pipeline.types.records import Scan, Step
+def compile_scans() -> None:
+    """Compile the kernels of the front end, of the columns and of the terrain, which need no SLAM, in the
+    order in which a scan needs them; then those that only whole scans need, see `map_scans`. Before these, it
+    waits up to _OTHER_S for the other program, which would otherwise compile the same kernels."""
+    from pipeline.classification import ColumnClassifier, ScanView
+    from pipeline.ground.terrain_map import HeightMapper
+    from pipeline.jit import is_kept
+    from pipeline.tracking.track_classification import classify_new
 
-    parameters, clusters, columns = Parameters(), ClusterTable(), None
-    T_base_lidar = Pose3.from_euler(np.array([0.0, 0.0, _SENSOR_Z]), 0.0, 0.0, 0.0)
-    mapper = Mapper(parameters, sensor=_sensor(), T_base_lidar=T_base_lidar, seed=0, forests=kept_forests())
-    for index in range(10):
-        along, at_ns = 0.1 * index, 100_000_000 * index
-        frame = mapper.process(
-            Step(
-                index,
-                Scan(at_ns, _returns(along)),
-                Pose2(along, 0.0, 0.0),
-                twist=(1.0, 0.0, 0.0),
-                elapsed_ns=at_ns,
-                period_ns=min(at_ns, 100_000_000),
-            )
-        )
+    mapper, terrain = _mapper(), HeightMapper()
+    columns = ColumnClassifier(mapper.parameters.classification, all_around=True, forests=kept_forests())
+    for step in _scans():
+        scan = mapper.segment(step)
+        pose, given = step.T_odom_base or Pose2(), scan.column_input
+        if given is not None:
+            view = ScanView(pose, scan.sensor_offset, scan.free, given.steepest, given.depth, given.terrain)
+            columns.add(given.points, given.height, step.index, view)
+        elif columns.is_unsettled:
+            columns.settle()
+        if scan.terrain is not None:
+            terrain.add(scan.terrain, pose, scan.sensor_offset)
+    until_s = time.monotonic() + _OTHER_S
+    while not is_kept(classify_new) and time.monotonic() < until_s:
+        time.sleep(_POLL_S)
+    map_scans()
+
+
+def map_scans() -> None:
+    """Compile or load all kernels of the mapper by mapping scans in this process, with a step back and a
+    preview."""
+    from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees
+
+    mapper, clusters, columns = _mapper(), ClusterTable(), None
+    for step in _scans():
+        frame = mapper.process(step)
         clusters.record(frame)
         columns = frame.columns
     mapper.snapshot().gathering.folded()  # as a step back does
-    preview_trees(KnownMap(parameters, clusters, mapper.path, columns), parameters)
+    preview_trees(KnownMap(mapper.parameters, clusters, mapper.path, columns), mapper.parameters)
 
 
+def _mapper() -> Mapper:
+    """Return a mapper of the scans of `_scans`."""
+    from pipeline.mapper import Mapper
+    from pipeline.types.records import Sensor
+
+    azimuth_step = 2.0 * np.pi / _SHOTS
+    return Mapper(
+        Parameters(),
+        sensor=Sensor("VLP-16", _RINGS, float(np.radians(2.0)), azimuth_step, range_sigma=_NOISE),
+        T_base_lidar=Pose3.from_euler(np.array([0.0, 0.0, _SENSOR_Z]), 0.0, 0.0, 0.0),
+        seed=0,
+        forests=kept_forests(),
+    )
+
+
+def _scans() -> Iterator[Step]:
+    """Yield ten steps of a robot that drives 0.1 m in the 0.1 s between two scans."""
+    from pipeline.types.records import Scan, Step
+
+    for index in range(10):
+        along, at_ns = 0.1 * index, 100_000_000 * index
+        scan, period_ns = Scan(at_ns, _returns(along)), min(at_ns, 100_000_000)
+        pose, twist = Pose2(along, 0.0, 0.0), (1.0, 0.0, 0.0)
+        yield Step(index, scan, pose, twist=twist, elapsed_ns=at_ns, period_ns=period_ns)
+
+
+_RINGS, _SHOTS = 16, 1800  # of a VLP-16
 _SENSOR_Z = 1.0  # m; height of the sensor above the ground
 _SPACING, _RADIUS, _NOISE = 2.5, 0.15, 0.01  # m; distance of the stems, their radius, noise of a range
 
@@ -195,7 +237,8 @@ def _returns(along: float) -> Float32:
         along: Position of the sensor along x [m].
     """
     azimuth, elevation = np.meshgrid(
-        np.linspace(-np.pi, np.pi, 1800, endpoint=False), np.radians(np.linspace(-15.0, 15.0, 16))
+        np.linspace(-np.pi, np.pi, _SHOTS, endpoint=False),
+        np.radians(np.linspace(-15.0, 15.0, _RINGS)),
     )
     level = np.cos(elevation)
     d = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]).reshape(3, -1)
@@ -211,25 +254,11 @@ def _returns(along: float) -> Float32:
     return np.ascontiguousarray((d[:, seen] * nearest[seen]).T, np.float32)
 
 
-def _sensor() -> Sensor:
-    """Return a sensor of 16 rings, 2 degrees apart, with 1,800 shots in each."""
-    from pipeline.types.records import Sensor
-
-    return Sensor(
-        name="VLP-16",
-        rings=16,
-        ring_step=float(np.radians(2.0)),
-        azimuth_step=2.0 * np.pi / 1800,
-        range_sigma=_NOISE,
-    )
-
-
 def map_stems() -> None:
     """Compile the kernels of SLAM, of the Kalman filters of the trees and of the preview, by mapping
     simulated stems."""
     from pipeline.classification import no_columns
     from pipeline.config import preset
-    from pipeline.geometry.poses import Pose3
     from pipeline.mapper import Mapper
     from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees
     from pipeline.tracking import Tracker
@@ -252,7 +281,6 @@ def _stems() -> Iterator[Step]:
     """Yield twelve steps, 0.1 s apart, of a robot that drives 0.5 m per scan along x, between trees in a grid
     with spacings of 3 m in x and 2.5 to 3 m in y; then one without trees, so far away that the trees are
     those of another place, and two between the trees again."""
-    from pipeline.geometry.poses import Pose2
     from pipeline.types.records import Scan, Stems, Step
 
     x, y = np.meshgrid(np.arange(-6.0, 12.0, 3.0), np.array([-4.0, -1.5, 1.5, 4.0]))
@@ -273,7 +301,7 @@ def simulate() -> None:
 
 
 if __name__ == "__main__":
-    _programs = {"warm_up": warm_up, "map_scans": map_scans, "map_stems": map_stems}
+    _programs = {"warm_up": warm_up, "compile_scans": compile_scans, "map_stems": map_stems}
     if sys.argv[1:]:
         run_child(lambda _: _programs[sys.argv[1]]())
     warm_up()

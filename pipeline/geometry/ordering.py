@@ -4,9 +4,12 @@ second to compile."""
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import Float, Int
+
+Int = NDArray[np.int64]
 
 #: Length of the runs that are sorted by insertion before they are merged (20 in NumPy).
 RUN = 20

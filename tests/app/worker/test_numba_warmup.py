@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from app.worker.numba_warmup import compiled_kernels, is_compiled, map_scans, map_stems, warm_up
+from app.worker.numba_warmup import compile_scans, compiled_kernels, is_compiled, map_stems, warm_up
 from app.worker.process import new_session
 from app.worker.protocol import Open
 from pipeline.config import Parameters
@@ -34,8 +34,8 @@ def seen():
         for signature in kernel.signatures
     }
 
-map_scans()
 map_stems()
+compile_scans()
 assert is_compiled()
 compiled, of_all = compiled_kernels()
 assert compiled > 0.95 * of_all, compiled
@@ -87,7 +87,7 @@ def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
     told = []
     with on_compiling(lambda: told.append(1)):
         numba_warmup.compile_ahead()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["map_scans", "map_stems"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["compile_scans", "map_stems"]
     assert [process.returncode for process in started] == [0, 0]
     assert told
 
@@ -105,9 +105,9 @@ def test_the_longest_program_begins_and_the_other_follows_at_the_second_step(mon
     monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
     steps = numba_warmup.compiling()
     assert next(steps) is False
-    assert started == ["map_scans"]
+    assert started == ["compile_scans"]
     assert next(steps) is True
-    assert started == ["map_scans", "map_stems"]
+    assert started == ["compile_scans", "map_stems"]
     steps.close()  # ends both
 
 

@@ -98,7 +98,7 @@ def new_machine(clone: Path) -> list[dict[str, Moment]]:
 
 def _row(name: str, seconds: list[float], cpu_s: list[float] | None, asked: float | None) -> tuple[Cell, ...]:
     reached = "" if asked is None else verdict(middle(seconds) <= asked)
-    return name, len(seconds), middle(seconds), max(seconds), cpu_s and middle(cpu_s), asked, reached
+    return name, len(seconds), middle(seconds), max(seconds), middle(cpu_s) if cpu_s else None, asked, reached
 
 
 def command(*words: str) -> list[str]:
