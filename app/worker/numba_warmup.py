@@ -227,11 +227,12 @@ def _scans() -> Iterator[Step]:
 _RINGS, _SHOTS = 16, 1800  # of a VLP-16
 _SENSOR_Z = 1.0  # m; height of the sensor above the ground
 _SPACING, _RADIUS, _NOISE = 2.5, 0.15, 0.01  # m; distance of the stems, their radius, noise of a range
+_HEDGE = 5.0  # m; distance of the hedge, whose wide cluster is searched for stems
 
 
 def _returns(along: float) -> Float32:
-    """Return a scan of 16 rings between stems on level ground, shape (N, 3) [m] in the frame of the sensor,
-    made without kernels.
+    """Return a scan between stems and beside a hedge on level ground, shape (N, 3) [m] in the frame of the
+    sensor, made without kernels.
 
     Args:
         along: Position of the sensor along x [m].
@@ -244,6 +245,8 @@ def _returns(along: float) -> Float32:
     d = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)]).reshape(3, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         nearest = np.where(d[2] < 0.0, -_SENSOR_Z / d[2], np.inf)
+        hedge = _HEDGE / d[1]
+        nearest = np.fmin(nearest, np.where((hedge > 0.0) & (abs(d[0]) < d[1]), hedge, np.inf))
         for x in np.arange(-4.0, 5.0) * _SPACING + 0.5 * _SPACING - along:
             for y in np.array([-1.5, -0.5, 0.5, 1.5]) * _SPACING:
                 a, b = d[0] ** 2 + d[1] ** 2, d[0] * x + d[1] * y
