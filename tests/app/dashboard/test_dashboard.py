@@ -30,6 +30,7 @@ from app.worker.protocol import (
     SetParameters,
     Shown,
     Status,
+    Unmapped,
 )
 from pipeline.config import preset
 from pipeline.errors import ParameterError, SourceError
@@ -125,6 +126,17 @@ async def test_opening_empties_the_page_at_once_and_nothing_of_the_old_run_comes
     assert scene_calls(dashboard)[-3][0] == "clear"
     assert (dashboard.shown, dashboard.truth, dashboard.path) == (None, None, None)
     assert "trees" not in browser_knows(dashboard)["truth"]
+
+
+async def test_a_scan_that_is_not_mapped_is_drawn_and_is_no_result(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened(truth=truth_trees()))
+    await dashboard.receive(Unmapped(1, frame(0, 1)))
+    assert scene_calls(dashboard)[-1][0] == "show"
+    assert dashboard.shown is None
+    await dashboard.receive(Shown(1, 0.0, frame(0, 1, n_trees=3), 0, path([0.0])))
+    await dashboard.receive(Unmapped(1, frame(1, 2)))
+    await asyncio.sleep(0.2)  # longer than two drawings are apart
+    assert ("show", 1) not in scene_calls(dashboard)  # the map stands
 
 
 async def test_a_source_that_cannot_be_opened_leaves_the_open_run_as_it_is(dashboard: Dashboard) -> None:
