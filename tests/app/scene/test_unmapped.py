@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import viser
 
 from app.scene import Scene
 from app.worker.unmapped import unmapped_frame
@@ -16,6 +17,6 @@ async def test_its_points_are_shown_and_the_first_mapped_scan_follows(scene: Sce
     step = Step(0, Scan(1, points), Pose2(1.0, 2.0, 0.5))
     scene.show(unmapped_frame(step, Pose3.identity()), np.zeros((0, 4)))
     raw = scene._server.scene.get_handle_by_name("/world/robot/scan/raw")
-    assert raw is not None
+    assert isinstance(raw, viser.PointCloudHandle)
     assert len(raw.points) == 300
     scene.show(make_frame(0), np.zeros((1, 4)))
