@@ -103,13 +103,16 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
     )
 
 
-def tree_story(run: Run | None, frame: Frame | None, number: int) -> TreeStory:
+def tree_story(
+    run: Run | None, frame: Frame | None, number: int, mapped: NDArray[np.float64] | None = None
+) -> TreeStory:
     """Return the explanation of a tree after a scan.
 
     Args:
         run: The open run, or None.
         frame: Results of the scan, or None; a run of one step has its own.
         number: Number of the tree.
+        mapped: Position of the tree among the accumulated points [m], shape (2,), if repairs have moved it.
 
     Raises:
         StemmapError: No run is open, no scan was mapped, there is no such tree at this time, or the forest in
@@ -143,7 +146,7 @@ def tree_story(run: Run | None, frame: Frame | None, number: int) -> TreeStory:
         last_seen_s=(int(trees.last_seen_ns[row]) - run.start_ns) / SECOND_NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
         column=column_story(frame, trees.position[row], parameters, _is_seen_all_around(run)),
-        points=points_around(run.voxels, trees.position[row]),
+        points=points_around(run.voxels, trees.position[row] if mapped is None else mapped),
         history=run.history(int(trees.number[row]), frame.index),
     )
 

@@ -522,7 +522,7 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
         case protocol.AskSection():
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
-            return protocol.Answer(ticket, section=section(run.accumulated))
+            return protocol.Answer(ticket, section=section(session.accumulated))
         case protocol.AskCourse(names=names, most=most, stages=stages):
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
@@ -530,7 +530,9 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
         case protocol.AskTree(tree=tree):
             if isinstance(run, OneStepRun):
                 return protocol.Answer(ticket, tree=run.tree_story(tree))
-            return protocol.Answer(ticket, tree=tree_story(run, session.frame, tree))
+            return protocol.Answer(
+                ticket, tree=tree_story(run, session.frame, tree, session.mapped_place(tree))
+            )
         case protocol.AskCluster(scan=scan, cluster=cluster):
             frame = recent.find(question.run, scan)
             if frame is None:

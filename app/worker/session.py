@@ -42,7 +42,7 @@ from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.repairs.record import Repair
 from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer, loops_of
 from pipeline.slam.keyframe_graph import KeyframeGraph
-from pipeline.types.records import Float, Frame, Int, Path, Trees
+from pipeline.types.records import Float, Float32, Frame, Int, Path, Trees
 from pipeline.types.units import SECOND_NS
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
@@ -153,6 +153,27 @@ class Session:
         if repaired is not None:
             return repaired.loops
         return loops_of(self._run.graph if isinstance(self._run, Run) else KeyframeGraph())
+
+    @property
+    def accumulated(self) -> Float32:
+        """Points of all scans up to the current one, see `Run.accumulated`, after the repairs of loops; none
+        without a run."""
+        run, repaired = self._run, self.repaired
+        points = np.zeros((0, 3), np.float32) if run is None else run.accumulated
+        if not isinstance(run, Run) or repaired is None or repaired.correction is None:
+            return points
+        scans = run.voxels.latest[: len(points)].astype(np.int64)
+        place, _ = repaired.correction.moved(points[:, :2].astype(np.float64), scans)
+        return np.column_stack([place, points[:, 2]]).astype(np.float32)
+
+    def mapped_place(self, number: int) -> Float | None:
+        """Return the position of a tree in the map before the repairs, shape (2,) [m]; None if that map has
+        no tree of this number."""
+        shown = self._kept or self._run
+        if shown is None or shown.frame is None:
+            return None
+        rows = np.flatnonzero(shown.frame.trees.number == number)
+        return shown.frame.trees.position[rows[0]] if len(rows) else None
 
     def set_repairs(self, repairs: tuple[Repair, ...]) -> Frame | None:
         """Set the repairs of the map and return the frame of the current scan with them; None before the

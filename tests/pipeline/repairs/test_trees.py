@@ -1,0 +1,110 @@
+"""Repairs of trees: each changes its row only, merged rows are weighted means, and files are checked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SourceError
+from pipeline.repairs.record import Kind, Repair, parse_repairs, read_repairs, repairs_text, unapplied
+from pipeline.repairs.trees import FIRST_ADDED, repaired_trees
+from pipeline.types.records import Trees
+from tests.pipeline.strategies import trees
+
+THREE = trees([[0.0, 0.0], [5.0, 0.0], [9.0, 1.0]])
+
+
+def repaired(kind: Kind, *places: tuple[float, float], value: str = "", of: Trees = THREE) -> Trees:
+    found, problem = repaired_trees(of, Repair(kind, places, value=value), FIRST_ADDED)
+    assert problem == ""
+    return found
+
+
+def test_a_merged_tree_is_the_weighted_mean_of_both_and_keeps_the_first_number():
+    of = replace(
+        THREE,
+        covariance=np.array([1.0, 4.0, 1.0])[:, None, None] * 1e-4 * np.eye(2),
+        dbh=np.array([0.3, 0.36, np.nan]),
+        dbh_sigma=np.array([0.01, 0.02, np.nan]),
+        sides=np.array([0b0011, 0b0110, 0]),
+        height=np.array([20.0, np.nan, 18.0]),
+        height_sigma=np.array([0.5, np.nan, 0.4]),
+        lean=np.array([0.1, 0.2, 0.0]),
+        first_seen_ns=np.array([5, 3, 0]),
+    )
+    found = repaired("merge", (0.1, 0.0), (5.1, 0.0), of=of)
+    np.testing.assert_array_equal(found.number, [1, 3])
+    np.testing.assert_allclose(found.position[0], [1.0, 0.0])  # the inverse variances are 4 to 1
+    assert found.dbh[0] == pytest.approx((4 * 0.3 + 0.36) / 5)
+    assert found.dbh_sigma[0] == pytest.approx(0.01 / np.sqrt(1.25))
+    assert found.observations[0] == 18
+    assert found.sides is not None
+    assert found.sides[0] == 0b0111
+    assert (found.first_seen_ns[0], found.last_seen_ns[0]) == (3, 10**9)
+    assert found.height is not None
+    assert found.height[0] == 20.0
+    assert found.lean is not None
+    assert found.lean[0] == pytest.approx(0.15)
+    np.testing.assert_array_equal(found.position[1], THREE.position[2])
+
+
+def test_a_split_tree_is_two_without_diameters():
+    found = repaired("split", (5.0, 0.1), (5.6, 0.0))
+    np.testing.assert_array_equal(found.number, [1, 2, 3, FIRST_ADDED])
+    np.testing.assert_array_equal(found.position[[1, 3]], [[5.0, 0.0], [5.6, 0.0]])
+    np.testing.assert_array_equal(np.isnan(found.dbh), [False, True, False, True])
+
+
+def test_move_class_and_delete_change_one_row():
+    np.testing.assert_array_equal(repaired("move", (5.0, 0.0), (6.0, 2.0)).position[1], [6.0, 2.0])
+    pole = repaired("class", (5.0, 0.0), value="pole")
+    np.testing.assert_array_equal(pole.confirmed, [True, False, True])
+    np.testing.assert_array_equal(repaired("class", (5.0, 0.0), value="tree", of=pole).confirmed, True)
+    np.testing.assert_array_equal(repaired("delete", (5.0, 0.0)).number, [1, 3])
+    assert repaired("class", (5.0, 0.0), value="tree") is THREE, "it is a tree already"
+
+
+def test_a_tree_is_not_merged_with_itself():
+    found, problem = repaired_trees(THREE, Repair("merge", ((0.0, 0.0), (0.2, 0.0))), FIRST_ADDED)
+    assert found is THREE
+    assert problem == "both positions are of tree 1"
+
+
+def test_a_file_of_repairs_is_read_as_it_was_written(tmp_path):
+    repairs = (
+        Repair("merge", ((0.125, -1.0), (2.0, 3.0))),
+        Repair("class", ((1.0, 2.0),), value="person"),
+        Repair("tie", ((0.0, 1.0), (1.0, 0.0)), (1_700_000_000_123_456_789, 1_700_000_001_000_000_001)),
+        Repair("forbid", stamps_ns=(1, 2)),
+    )
+    assert parse_repairs(repairs_text(repairs), "file") == repairs
+    assert parse_repairs(repairs_text(()), "file") == ()
+    with pytest.raises(SourceError, match="cannot be read"):
+        read_repairs(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"repairs": [{"kind": "burn"}]}',
+        '{"repairs": [{"kind": "delete", "places": [[1]]}]}',
+        '{"repairs": [{"kind": "delete", "places": [[1, NaN]]}]}',
+        '{"repairs": [{"kind": "delete", "places": [[1, 2]], "stamps_ns": [1]}]}',
+        '{"repairs": [{"kind": "tie", "places": [[1, 2], [1, 2]], "stamps_ns": [1]}]}',
+        '{"repairs": [{"kind": "class", "places": [[1, 2]], "value": "stone"}]}',
+        '{"repairs": [{"kind": "delete", "places": [[1, 2]], "who": "me"}]}',
+    ],
+)
+def test_what_is_no_file_of_repairs_is_refused(text):
+    with pytest.raises(SourceError):
+        parse_repairs(text, "file")
+
+
+def test_what_does_not_apply_is_said_with_its_number():
+    repairs = [Repair("delete", ((0.0, 0.0),)), Repair("move", ((1.0, 0.0), (2.0, 0.0)))]
+    assert unapplied(repairs, ["", "no tree"]) == ["repair 2 (move) does not apply: no tree"]
