@@ -164,7 +164,7 @@ def test_an_answer_that_compiled_leaves_nothing_to_wait_for(monkeypatch: pytest.
         waiting.put(message)
     driver = WorkerLoop(session, waiting, said.append)
 
-    def compile_first(_run: object, _frame: object, number: int) -> None:
+    def compile_first(_run: object, _frame: object, number: int, _mapped: object) -> None:
         driver.compiling()
         raise StemmapError(f"tree {number} is not known")
 
