@@ -498,7 +498,7 @@ def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_story_that_fails_is_logged_and_stops_nothing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(_run: object, _frame: object, _number: int) -> None:
+    def fail(_run: object, _frame: object, _number: int, _mapped: object) -> None:
         raise ZeroDivisionError("on purpose")
 
     session = make_session(FakeSource(3))
