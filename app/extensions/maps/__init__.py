@@ -2,7 +2,26 @@
 
 from __future__ import annotations
 
-from app.extension import Extension
+from typing import TYPE_CHECKING
+
+from app.extension import Extension, page_folder
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+
+def _add_routes(app: FastAPI) -> None:
+    """Add the localisation in a stored map and its routes to a dashboard."""
+    from app.extensions.maps.page import Locating
+    from app.extensions.maps.routes import router
+
+    dashboard = app.state.dashboard
+    app.state.locating = locating = Locating(
+        dashboard, lambda state: dashboard.live.publish("localise", state)
+    )
+    app.state.closing.append(locating.close)
+    app.include_router(router)
+
 
 EXTENSION = Extension(
     help="maps of several drives: stemmap map --continue, merge, localise and pack",
@@ -11,5 +30,7 @@ EXTENSION = Extension(
         "localise": "app.extensions.maps.localise_command",
         "pack": "app.extensions.maps.pack_command",
     },
+    web=_add_routes,
+    page=page_folder("maps"),
     takes={"map": "app.extensions.maps.map_command"},
 )

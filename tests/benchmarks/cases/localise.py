@@ -38,10 +38,8 @@ def run() -> list[Table]:
     """A table with simulated stands, and one with the recorded drives if they are there."""
     starts = int(os.environ.get("STEMMAP_BENCH_STARTS", STARTS))
     root = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
-    tables = [_simulated(starts)]
-    if (root / "wild_places").is_dir():
-        tables += _recorded(root, starts)
-    return tables
+    tables = _recorded(root, starts) if (root / "wild_places").is_dir() else []
+    return [*tables, _simulated(starts)]
 
 
 def _simulated(starts: int) -> Table:

@@ -1,0 +1,96 @@
+"""The open run of a dashboard is located in the map of a stored run."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.common.settings import Settings
+from app.extensions.maps import page
+from app.extensions.maps.page import Locating
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Pose2
+from tests.app.batch.finished_runs import write_run
+from tests.app.server_for_tests import BEARER, running
+from tests.pipeline.localisation.stands import stand, trees_at
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(60):
+        while not condition():
+            await asyncio.sleep(0.02)
+
+
+def shown(stamp_ns: int, place: np.ndarray, T_odom_base: Pose2) -> Any:
+    """A shown scan with a map of trees."""
+    frame = SimpleNamespace(
+        stamp_ns=stamp_ns,
+        estimate=SimpleNamespace(T_map_base=T_odom_base),
+        trees=trees_at(place, stamp_ns),
+        ground=None,
+        base_z=0.0,
+        of_drive=True,
+    )
+    return SimpleNamespace(frame=frame)
+
+
+def dashboard() -> Any:
+    """A dashboard that has shown nothing yet."""
+    parameters = SimpleNamespace(relocalisation=SimpleNamespace(slack=0.1))
+    return SimpleNamespace(run=1, shown=None, parameters=SimpleNamespace(parameters=parameters))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A finished run with the map of a stand."""
+    place = stand(1, side=60.0)
+    return Path(write_run(tmp_path / "stand", place, np.full(len(place), 0.3)))
+
+
+async def test_it_is_found_told_and_forgotten(folder, monkeypatch):
+    monkeypatch.setattr(page, "PAUSE_S", 0.01)
+    told: list[dict[str, Any]] = []
+    here = dashboard()
+    locating = Locating(here, told.append)
+    assert locating.as_plain()["state"] == "idle"
+    await locating.begin("stand", folder)
+    assert told[-1] == {"name": "stand", "state": "searching", "text": "not found yet", "pose": None}
+    true = Pose2(30.0, 30.0, 0.5)  # of the open run in the stored map
+    place = stand(1, side=60.0)
+    near = place[np.hypot(*(place - 30.0).T) < 14.0]
+    here.shown = shown(1_000_000_000, true.inverse().apply(near), Pose2())
+    await until(lambda: told[-1]["state"] == "found")
+    assert told[-1]["text"].startswith("found: ")
+    assert told[-1]["pose"] == pytest.approx(true.inverse().as_array().tolist(), abs=0.05)
+    here.run, here.shown = 2, shown(1_000_000_000, np.zeros((0, 2)), Pose2())  # another run is opened
+    await until(lambda: told[-1]["state"] == "searching")
+    await locating.forget()
+    assert told[-1]["state"] == "idle"
+    await locating.close()
+
+
+async def test_a_map_without_trees_is_refused(tmp_path):
+    empty = write_run(tmp_path / "empty", np.zeros((0, 2)), np.zeros(0))
+    locating = Locating(dashboard(), lambda _: None)
+    with pytest.raises(StemmapError, match="no trees"):
+        await locating.begin("empty", empty)
+    assert locating.as_plain()["state"] == "idle"
+
+
+async def test_routes(folder):
+    async with running(Settings(recordings=folder.parent)) as (client, _):
+        client.headers.update(BEARER)
+        assert (await client.post("/api/localise", json={"run": "folder:none"})).status_code == 404
+        begun = await client.post("/api/localise", json={"run": "folder:stand"})
+        assert begun.status_code == 202, begun.text
+        assert begun.json()["state"] == "searching"
+        got = (await client.get("/api/localise")).json()
+        assert len(got["stems"]) == len(stand(1, side=60.0))
+        assert (await client.delete("/api/localise")).json()["state"] == "idle"
+        assert (await client.get("/api/localise")).json()["stems"] == []
