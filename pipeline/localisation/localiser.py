@@ -25,7 +25,7 @@ from pipeline.localisation.search import Fix, MapIndex, false_alarms, fix_near, 
 from pipeline.localisation.stored_map import StoredMap
 from pipeline.loop_closure.stem_matching import MapStems, Match, worst_sigma
 from pipeline.slam.places import AGREEING, ODDS
-from pipeline.types.records import Bool, Int, Trees
+from pipeline.types.records import Bool, Detections, Int, Trees
 
 #: Probability that any search of a drive accepts a wrong pose. The k-th search has the share 1 / (k (k + 1)),
 #: so that all shares sum to 1 whatever the length of the drive.
@@ -35,9 +35,11 @@ SEARCH_EVERY = 4.0  # m of driven path between two searches
 GROWN = 1.25  # a search also follows when the number of stems has grown by this factor
 TRACK_EVERY = 1.0  # m of driven path between two alignments
 LOCAL = 60.0  # m of driven path, in which the stems of a search were seen; drift bends longer ones
-RECENT = 20.0  # m of driven path, in which the stems of an alignment were seen
+RECENT = 0.5  # m of driven path, in which the stems of an alignment were seen, without detections
 REACH = 30.0  # m around the robot, in which stems of an alignment are
 MOST_STEMS = 120  # of a search, those nearest to the robot
+# Part of the distortion of the maps that the stems around the robot share, in the errors of the pose.
+SHARED = 1.0 / 3.0
 FEWEST = 5  # stems inside the map from which a fix is judged
 # Drift of the odometry outside of the map: m/sqrt(m) and rad/sqrt(m), those of wheels on soft ground.
 DRIFT_XY, DRIFT_YAW = 0.05, 0.01
@@ -123,12 +125,18 @@ class Localiser:
         self._stamp_ns: list[int] = []
         self._driven: list[float] = []
         self._pose = Pose2()
+        self._view: Detections | None = None
         self._fix: Fix | None = None
         self._fixed_at = self._next = 0.0
-        self._searched_stems = 0
+        self._searched_stems = self._first = 0
 
     def update(
-        self, stamp_ns: int, T_odom_base: Pose2, trees: Trees, terrain: Float | None = None
+        self,
+        stamp_ns: int,
+        T_odom_base: Pose2,
+        trees: Trees,
+        terrain: Float | None = None,
+        view: Detections | None = None,
     ) -> Localisation:
         """Add the local map after a scan, and return the localisation.
 
@@ -137,7 +145,10 @@ class Localiser:
             T_odom_base: Pose of the robot in the local frame.
             trees: The local map, in the local frame. Only confirmed trees count.
             terrain: x, y, z of the cells of the local terrain, shape (K, 3) [m]; None if unknown.
+            view: Trees of the scan in the base frame, which tell where the robot is now even if its pose in
+                the local map has slipped; None takes the trees of the local map that were seen last.
         """
+        self._view = view
         before, self._pose = self._pose, T_odom_base
         driven = 0.0
         if self._driven:
@@ -173,7 +184,8 @@ class Localiser:
 
     def _search(self, index: MapIndex, trees: Trees, terrain: Float | None) -> None:
         """Search the stems of the last metres in the map, if enough are new since the last search."""
-        rows = self._recent(trees, LOCAL, MOST_STEMS)
+        rows = self._recent(trees, LOCAL)
+        rows = rows[trees.confirmed[rows]][:MOST_STEMS]
         driven = self._driven[-1]
         if len(rows) < FEWEST or (driven < self._next and len(rows) < GROWN * self._searched_stems):
             return
@@ -183,8 +195,14 @@ class Localiser:
         stems = _stems(trees, rows)
         fix = search_map(stems, index, self._slack, level)
         if fix.reason is None and fix.pose is not None:
-            self.localisation = replace(self.localisation, searches=k)
-            self._use(fix, fix.pose, terrain, is_new=True)
+            now = fix_near(fix.pose, self._in_view(trees), index, self._slack)
+            if now.pose is not None and _log_odds(len(now.local), now.inside, now.chance) > ODDS:
+                self.localisation = replace(self.localisation, searches=k)
+                self._use(now, now.pose, terrain, is_new=True)
+            else:  # the local map is of one place, and the robot in another
+                self.localisation = replace(
+                    self.localisation, state=State.SEARCHING, searches=k, reason="the stems in view disagree"
+                )
             return
         absent = _would_be_found(fix, len(stems), level)
         state = State.ABSENT if absent else State.SEARCHING
@@ -193,13 +211,14 @@ class Localiser:
     def _track(self, index: MapIndex, T_map_odom: Pose2, trees: Trees, terrain: Float | None) -> None:
         """Fit the pose again to the nearby stems; withdraw it if they contradict it."""
         self._next = self._driven[-1] + TRACK_EVERY
-        rows = self._recent(trees, RECENT, MOST_STEMS)
-        fix = fix_near(T_map_odom, _stems(trees, rows), index, self._slack)
+        fix = fix_near(T_map_odom, self._in_view(trees), index, self._slack)
         if fix.inside < FEWEST:  # outside of the map
             self._drift()
             return
-        if _log_odds(len(fix.local), fix.inside, fix.chance) < -ODDS:
+        agreeing = len(fix.local) >= AGREEING * fix.inside  # as for a new fix
+        if not agreeing or _log_odds(len(fix.local), fix.inside, fix.chance) < -ODDS:
             self._fix, self._searched_stems = None, 0
+            self._first = len(self._stamp_ns) - 1  # what was seen before is in another place of the local map
             l10n = self.localisation
             self.localisation = Localisation(
                 driven=l10n.driven,
@@ -219,6 +238,7 @@ class Localiser:
         self._fix, self._fixed_at = fix, self._driven[-1]
         self._next = self._driven[-1] + TRACK_EVERY
         at = pose.apply(place[None])[0]
+        shared = (SHARED * self._slack) ** 2
         height = (
             None
             if terrain is None
@@ -228,7 +248,7 @@ class Localiser:
             self.localisation,
             state=State.FOUND,
             T_map_odom=pose,
-            covariance=fix.covariance_at(place),
+            covariance=fix.covariance_at(place) + np.diag([shared, shared, 0.0]),
             stems=len(fix.local),
             of=max(fix.inside, len(fix.local)),
             residual=fix.residual,
@@ -247,16 +267,26 @@ class Localiser:
         grown = replace(self._fix, covariance=self._fix.covariance + added)
         self.localisation = replace(self.localisation, covariance=grown.covariance_at(place), stems=0, of=0)
 
-    def _recent(self, trees: Trees, way: float, most: int) -> Int:
-        """Return the rows of the confirmed trees that were seen in the last `way` metres within REACH of the
-        robot, at most `most`, nearest first."""
-        first = int(np.searchsorted(self._driven, self._driven[-1] - way))
-        seen: Bool = trees.confirmed & (trees.last_seen_ns >= self._stamp_ns[first])
+    def _in_view(self, trees: Trees) -> MapStems:
+        """Return the stems that tell where the robot is now, in the local frame."""
+        view = self._view
+        if view is None:
+            return _stems(trees, self._recent(trees, RECENT)[:MOST_STEMS])
+        sigma = worst_sigma(view.covariance[:, [0, 0, 1], [0, 1, 1]])
+        unknown = np.full(len(sigma), np.nan)
+        stems = MapStems(self._pose.apply(view.centre), sigma, unknown, unknown)
+        return stems.take(stems.usable())
+
+    def _recent(self, trees: Trees, way: float) -> Int:
+        """Return the rows of the trees, also of unconfirmed ones, that were seen in the last `way` metres,
+        nearest first; for RECENT within REACH of the robot."""
+        first = max(int(np.searchsorted(self._driven, self._driven[-1] - way)), self._first)
+        seen: Bool = trees.last_seen_ns >= self._stamp_ns[first]
         rows = np.flatnonzero(seen & np.isfinite(trees.position).all(axis=1))
         distance = np.hypot(*(trees.position[rows] - [self._pose.x, self._pose.y]).T)
         order = np.argsort(distance, kind="stable")
         reach = np.inf if way == LOCAL else REACH
-        nearest: Int = rows[order[distance[order] <= reach][:most]]
+        nearest: Int = rows[order[distance[order] <= reach]]
         return nearest
 
 

@@ -66,7 +66,9 @@ class LocalisedRun:
             self._start_ns = frame.stamp_ns
         before = self.localisation
         T_odom_base = frame.estimate.T_map_base
-        got = self.localiser.update(frame.stamp_ns, T_odom_base, frame.trees, self._near(frame))
+        got = self.localiser.update(
+            frame.stamp_ns, T_odom_base, frame.trees, self._near(frame), frame.detections
+        )
         seconds = number_text((frame.stamp_ns - self._start_ns) * 1e-9, 3)
         T_map_odom = got.pose_3d
         if got.T_map_odom is not None and T_map_odom is not None:

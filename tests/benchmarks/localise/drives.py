@@ -16,7 +16,7 @@ from pipeline.localisation import StoredMap
 from pipeline.loop_closure.stem_matching import aligned
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.types.records import Int, Odometry, Record, Scan, Stems, Trees
+from pipeline.types.records import Detections, Int, Odometry, Record, Scan, Stems, Trees
 from tests.benchmarks.tree_manager_folder import perturbed, read_recorded
 
 #: Of the made odometry, as in the benchmark `oxford`: part of a step's length, rad/sqrt(m), rad/m.
@@ -67,12 +67,14 @@ class Drive:
             yield Odometry(stamp, pose)
             yield Scan(stamp, xyz[rows].astype(np.float32), stems=Stems(axis[rows], dbh[rows]))
 
-    def mapped(self, begin: int, end: int, seed: int) -> Iterator[tuple[int, int, Pose2, Trees]]:
-        """Map frames from a new origin; yield the number of each frame, its time, pose and the trees."""
+    def mapped(self, begin: int, end: int, seed: int) -> Iterator[tuple[int, int, Pose2, Trees, Detections]]:
+        """Map frames from a new origin; yield the number of each frame, its time, pose, the trees and
+        the detections."""
         mapper = Mapper(preset("stems"), sensor=STEM_FINDER, T_base_lidar=Pose3.identity(), seed=seed)
         for step in steps(self.records(begin, end, np.random.default_rng(seed))):
             frame = mapper.process(step)
-            yield begin + step.index, frame.stamp_ns, frame.estimate.T_map_base, frame.trees
+            T_odom_base = frame.estimate.T_map_base
+            yield begin + step.index, frame.stamp_ns, T_odom_base, frame.trees, frame.detections
 
     def map(self, seed: int) -> Reference:
         """Map the whole drive."""

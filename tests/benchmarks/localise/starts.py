@@ -67,12 +67,12 @@ def run_start(
     localisers = [Localiser(reference.stored) for reference in references]
     starts = [Start(reference.covers(truth[begin:end, :2])) for reference in references]
     errors: list[list[tuple[float, float]]] = [[] for _ in references]
-    for frame, stamp_ns, pose, trees in drive.mapped(begin, end, seed):
+    for frame, stamp_ns, pose, trees, view in drive.mapped(begin, end, seed):
         for reference, localiser, start, of, offset in zip(
             references, localisers, starts, errors, offsets, strict=True
         ):
             searches, began = localiser.localisation.searches, time.thread_time()
-            got = localiser.update(stamp_ns, pose, trees)
+            got = localiser.update(stamp_ns, pose, trees, view=view)
             if got.searches > searches:
                 start.search_s.append(time.thread_time() - began)
             start.state, start.withdrawn = got.state, got.withdrawn

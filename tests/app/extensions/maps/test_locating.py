@@ -33,6 +33,7 @@ def shown(stamp_ns: int, place: np.ndarray, T_odom_base: Pose2) -> Any:
         stamp_ns=stamp_ns,
         estimate=SimpleNamespace(T_map_base=T_odom_base),
         trees=trees_at(place, stamp_ns),
+        detections=None,
         ground=None,
         base_z=0.0,
         of_drive=True,
