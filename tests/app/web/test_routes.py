@@ -311,6 +311,9 @@ def test_recordings_in_folders_are_named_by_their_path_in_the_data_folder(
     for name in (
         "plot/day/1.mcap",
         "plot/day/2.mcap",
+        "plot/bag/metadata.yaml",
+        "plot/bag/bag_0.mcap",
+        "plot/bag/bag_1.mcap",
         "plot/b.pcap",
         "plot/b.txt",
         "kitti/velodyne/0.bin",
@@ -333,7 +336,9 @@ def test_recordings_in_folders_are_named_by_their_path_in_the_data_folder(
 
     monkeypatch.setattr(readers, "folder_opener", refused)
     found = recordings([tmp_path, tmp_path / "nowhere"])
-    assert [name for _, name in found] == ["kitti", "plot/b.pcap", "plot/day"]
+    assert [name for _, name in found] == [
+        "kitti", "plot/b.pcap", "plot/bag", "plot/day/1.mcap", "plot/day/2.mcap",
+    ]  # fmt: skip
     assert all(path == tmp_path / name for path, name in found)
 
 
