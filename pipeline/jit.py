@@ -184,9 +184,8 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
         module: Dotted name of the module that defines the kernel.
     """
     file = kernel._cache._cache_file  # Numba has no public interface for this
-    file._source_stamp = sources_digest(
-        module
-    )  # not the time of the file: copies of the sources share a cache
+    # not the time of the file: copies of the sources share a cache
+    file._source_stamp = sources_digest(module)
     # Numba numbers its files from zero after a change of the sources, and writes the index first. A process
     # that ends in between, or reads meanwhile, would run old machine code. No two sources share a file name.
     digest = hashlib.sha256(repr(file._source_stamp).encode()).hexdigest()[:12]
@@ -209,8 +208,10 @@ def _copy_delivered(delivered: Path, file: Any, base: str) -> None:  # noqa: ANN
         base: Beginning of the names of the files with machine code of the present sources.
     """
     index = Path(file._index_path)
+    if index.parent == delivered:
+        return
     codes = tuple(delivered.glob(f"{glob.escape(base)}.*.nbc"))
-    if index.parent == delivered or not codes or file._load_index():
+    if not codes or file._load_index():
         return
     with suppress(OSError):  # else the kernel is compiled
         index.parent.mkdir(parents=True, exist_ok=True)
@@ -266,17 +267,17 @@ def is_kept(kernel: Callable[..., Any]) -> bool:
 
 def sources_digest(module: str) -> str:
     """Return the SHA-256 (hex) of the source of a module and of all loaded modules of its top-level package
-    that it imports, directly or indirectly. Sources are read once per process: later changes of the files
-    have no effect.
+    and of this one that it imports, directly or indirectly. Sources are read once per process: later changes
+    of the files have no effect.
 
     Args:
         module: Dotted name of a loaded module.
     """
-    package = module.partition(".")[0] + "."
+    packages = tuple(f"{name.partition('.')[0]}." for name in (module, __name__))
     seen = {module}
     waiting = [module]
     while waiting:
-        found = {name for name in _imported(waiting.pop()) if name.startswith(package)} - seen
+        found = {name for name in _imported(waiting.pop()) if name.startswith(packages)} - seen
         seen |= found
         waiting += found
     digest = hashlib.sha256()
