@@ -1,4 +1,4 @@
-"""Comparison of two visits of one stand: alignment by their stems, growth, new, missing and moved trees."""
+"""Comparison of two maps of one stand: alignment by their stems, growth, new, missing and moved trees."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class VisitTrees:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisitComparison:
-    """Two visits, a the earlier one.
+    """Two maps of one stand, a the earlier one.
 
     Attributes:
         T_a_b: Pose of the frame of b in that of a.
@@ -94,7 +94,7 @@ def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tu
             return there @ found.pose @ back, len(found.local)
         reason = found.reason or reason
     raise StemmapError(
-        f"the stems of the two visits do not agree with certainty ({reason})",
+        f"the stems of the two maps do not agree with certainty ({reason})",
         remedy="Compare visits that share more trees, or give --same-frame if their coordinates are the same",
     )
 
@@ -102,7 +102,7 @@ def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tu
 def compare_visits(
     a: VisitTrees, b: VisitTrees, T_a_b: Pose2, *, reach: float, refine: bool, stems: int = 0
 ) -> VisitComparison:
-    """Pair the trees of two visits one to one (`match`) and compare them. Trees without a finite position
+    """Pair the trees of two maps one to one (`match`) and compare them. Trees without a finite position
     have no partner.
 
     Args:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import os
 import platform
+import re
 import shutil
 import socket
 import sys
@@ -13,9 +12,11 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, metadata, requires
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from app.common.child_process import usable_cores
 from app.common.settings import DEFAULT_PORT
 
 if TYPE_CHECKING:
@@ -30,14 +31,7 @@ CORES = 2  # the worker and the web process
 #: Seconds since 1970 of 2026-01-01: a clock before it was never set.
 EARLIEST_S = 1_767_225_600
 _SYNCHRONISED = Path("/run/systemd/timesync/synchronized")
-#: A module of each optional extra of the package, and what it is for.
-EXTRAS = {
-    "e57": ("pye57", "E57 clouds"),
-    "ouster": ("ouster", "raw packets of Ouster"),
-    "dds": ("cyclonedds", "ROS 2 live over plain DDS"),
-    "dask": ("distributed", "many runs on a cluster"),
-    "gis": ("geopandas", "GIS files, DXF, XLSX and GeoTIFF"),
-}
+_EXTRA = re.compile(r"([\w.-]+).*extra == ['\"](\w+)['\"]")  # a package of an extra, as metadata name it
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,14 +122,11 @@ def available_memory() -> int | None:
         group = Path("/sys/fs/cgroup")
         limit = int((group / "memory.max").read_text(encoding="ascii"))
         used = int((group / "memory.current").read_text(encoding="ascii"))
+        rows = (line.split() for line in (group / "memory.stat").read_text(encoding="ascii").splitlines())
+        used -= next((int(size) for name, size in rows if name == "inactive_file"), 0)  # cache of files
     except (OSError, ValueError):  # no control group, or no limit ("max")
         return free
     return min(free, max(limit - used, 0))
-
-
-def usable_cores() -> int:
-    """Return the number of cores on which this process may run."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def cores_check(cores: int) -> Check:
@@ -233,18 +224,32 @@ def port_check(host: str, port: int | None) -> Check:
     return Check("port", f"{host}:{number} is free")
 
 
-def extra_checks(find: Callable[[str], object] = importlib.util.find_spec) -> list[Check]:
-    """Return whether each optional extra is installed.
+def extra_checks(missing: Callable[[str], bool] | None = None) -> list[Check]:
+    """Return whether the packages of each optional extra are installed.
 
     Args:
-        find: Returns None for a module that is not installed.
+        missing: Returns whether a package is not installed; None asks the metadata of this installation.
     """
+    packages: dict[str, list[str]] = {}
+    offer = "not installed; uv sync --extra {} adds it"
+    for text in requires("stemmap") or ():
+        if found := _EXTRA.match(text):
+            packages.setdefault(found.group(2), []).append(found.group(1))
     return [
         Check(
             f"extra {name}",
-            purpose,
-            "" if find(module) is not None else f"not installed; uv sync --extra {name} adds it",
+            ", ".join(needed),
+            offer.format(name) if any(map(missing or _is_missing, needed)) else "",
             is_needed=False,
         )
-        for name, (module, purpose) in EXTRAS.items()
+        for name, needed in sorted(packages.items())
     ]
+
+
+def _is_missing(package: str) -> bool:
+    """Return whether a package is not installed."""
+    try:
+        metadata(package)
+    except PackageNotFoundError:
+        return True
+    return False

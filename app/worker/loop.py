@@ -350,7 +350,9 @@ class WorkerLoop:
             self._replay.release()
             self._report()
             return
-        frame = self._session.show_unmapped()
+        frame = None
+        with contextlib.suppress(StemmapError):  # which the mapper meets when it comes to this scan
+            frame = self._session.show_unmapped()
         if frame is not None:
             self._put(protocol.Unmapped(self._run, frame))
         self._prepared = False

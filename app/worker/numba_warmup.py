@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from app.common.child_process import BlockingChildProcess, python_module, run_child
+from app.common.child_process import BlockingChildProcess, python_module, run_child, usable_cores
 from app.common.settings import data_folder
 from app.store.forests import kept_forests
 from pipeline.config import Parameters
@@ -58,7 +58,7 @@ def compiling() -> Generator[bool, None, None]:
     The second process starts at the second step, so that the caller can compile the kernels of its source in
     the first one on its own core.
     """
-    if _cores() < len(PROGRAMS) or is_compiled():
+    if usable_cores() < len(PROGRAMS) or is_compiled():
         return
     with contextlib.ExitStack() as stack:
         yield from _lock(stack)
@@ -91,11 +91,6 @@ def compiled_kernels() -> tuple[int, int]:
     from pipeline.jit import count_kept
 
     return min(_KERNELS, count_kept()), _KERNELS
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def _start(program: str) -> BlockingChildProcess:
@@ -145,6 +140,8 @@ def _lock(stack: contextlib.ExitStack) -> Iterator[bool]:
             while time.monotonic() < until_s:
                 with contextlib.suppress(BlockingIOError):
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    return
+                if is_compiled():  # its holder may be suspended
                     return
                 others_compile()
                 yield is_front_end_compiled()

@@ -197,6 +197,8 @@ class Run:
             StemmapError: The scan cannot be mapped, for example because a forest does not exist; the mapper
                 is broken until `approach`.
         """
+        if self.current < 0 and self._cursor.known and not self._is_live:
+            self._cursor.go_to(0)  # scans were shown before the first one was mapped
         step = self._cursor.take()
         if step is None:
             return None

@@ -6,7 +6,7 @@ It has no thread, socket or clock; the loop of the worker reads `pace` and calls
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Literal
@@ -258,6 +258,9 @@ class Session:
                 source.close()
                 raise
             self._robot, self._state, self._detail = source, "waiting", ""
+            if isinstance(self._compiling, Generator):
+                self._compiling.close()  # its lock would keep the warm-up waiting
+            self._compiling = self._compile()
             self._warm_up()
             return None
         return self._begin(source, request)

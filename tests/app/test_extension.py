@@ -136,6 +136,6 @@ def test_a_refusal_names_the_extensions_that_are_switched_off(tmp_path, capsys, 
     assert main(["map", str(tmp_path / "run.laser"), "--out", str(tmp_path / "out")]) != 0
     error = capsys.readouterr().err
     off = [each.name for each in extension.all_extensions() if not each.is_on]
-    assert len(off) == {None: 0, "": 8, "stand": 7}[wanted]
+    assert len(off) == {None: 0, "": 9, "stand": 8}[wanted]
     assert (extension.VARIABLE in error) == bool(off)
     assert all(name in error.splitlines()[-1] for name in off)

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import jit
-
 ROOT = Path(__file__).resolve().parents[2]
 
 CALLER = """
@@ -104,17 +102,6 @@ def test_a_change_is_seen_through_attributes_of_a_module(folder):
     (folder / "wood" / "tree.py").write_text(CALLER_OF_MODULE)
     assert call(folder, 2.0, 1.0) == ["4.0", *COMPILED]
     assert call(folder, 5.0, 3.0) == ["20.0", *COMPILED]
-
-
-def test_a_kernel_of_another_package_is_compiled_again_when_a_source_of_the_pipeline_changes(monkeypatch):
-    module = importlib.import_module("app.extensions.clouds.inventory.cross_sections").__name__
-    source, before = jit._source, jit.sources_digest(module)
-    assert jit.sources_digest(module) == before
-    for changed in ("pipeline.classification.voxel_map", "app.extensions.clouds.inventory.cross_sections"):
-        monkeypatch.setattr(jit, "_source", lambda name, at=changed: source(name) + b"#" * (name == at))
-        assert jit.sources_digest(module) != before
-    monkeypatch.setattr(jit, "_source", lambda name: source(name) + b"#" * (name == "pipeline.mapper"))
-    assert jit.sources_digest(module) == before, "which it does not import"
 
 
 def test_processes_that_compile_a_kernel_for_different_types_at_once_store_all_of_them(folder):

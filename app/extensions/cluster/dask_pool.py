@@ -36,6 +36,7 @@ class DaskPool:
             )
         self._address = address
         self._client: Any = None
+        self._is_closed = False
         self._futures: set[Any] = set()
         self._places: list[str] = []  # address of a worker for each of its threads
 
@@ -78,20 +79,28 @@ class DaskPool:
     def close(self, function: Callable[[], None]) -> None:
         """Cancel the tasks, call a function once in each worker that can be reached, and leave the
         cluster."""
-        client, self._client = self._client, None
-        if client is not None:
+        client, self._client, self._is_closed = self._client, None, True
+        if client is None:
+            return
+        try:
             client.cancel(list(self._futures), reason="the command ended")
             client.run(function, on_error="ignore")
+        except OSError:  # the scheduler is gone
+            pass
+        finally:
             client.close()
 
     def _connect(self) -> Any:  # noqa: ANN401 - distributed has no types
         """Return the client, connected.
 
         Raises:
-            StemmapError: No scheduler answers, it has no workers, or one of them has another version.
+            StemmapError: No scheduler answers, it has no workers, one of them has another version, or the
+                pool is closed.
         """
         if self._client is not None:
             return self._client
+        if self._is_closed:
+            raise StemmapError("the cluster was left", where=self._address)
         from distributed import Client
 
         try:

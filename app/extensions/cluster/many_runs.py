@@ -30,9 +30,12 @@ from app.common.child_process import (
 from app.common.task_pool import TaskPool
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import UNFINISHED, write_texts
+from pipeline.io.result_files import ODOMETRY
 
 TABLE = "runs.csv"
 _COLUMNS = ("run", "exit_code", "trees", "scans", "distance_m", "message")
+#: Files of an earlier map, which may have another frame, as `RunFiles.finish` removes them.
+_OF_EARLIER = ("seen.csv", "georeference.json", ODOMETRY, "state.zip")
 _CANNOT_RUN = 1  # exit code of a run whose process was lost
 
 
@@ -57,7 +60,7 @@ class _Outcome(msgspec.Struct, frozen=True):
     messages: str
 
 
-_running: set[BlockingChildProcess] = set()  # the processes of this process's tasks
+_running: set[BlockingChildProcess] = set()  # the processes of the tasks of this process
 _lock = threading.Lock()
 
 
@@ -179,23 +182,25 @@ def map_runs(
 
 
 def _written(folder: Path, result: MappedFiles, *, force: bool) -> MappedFiles:
-    """Write the files of a run to its folder, which is replaced as a whole; return the result, or that of a
-    failure if the folder has the map of another source. Raises OSError."""
+    """Write the files of a run to its folder, run.json last, and remove those of an earlier map that are
+    missing now; other files stay. Return the result, or that of a failure if the folder has the map of
+    another source. Raises OSError."""
     if not result.files:
         return result
     try:
         check_folder(folder, json.loads(result.files["run.json"])["source"]["sha256"], force=force)
     except (StemmapError, KeyError, ValueError) as error:
         return MappedFiles(_CANNOT_RUN, [*result.messages, f"stemmap: {error}"], {})
-    with TemporaryDirectory(prefix=f"{UNFINISHED}{folder.name}-", dir=folder.parent) as parent:
-        partial = Path(parent) / "run"
-        for name, content in result.files.items():
-            file = partial / name
+    folder.mkdir(exist_ok=True)
+    for name in _OF_EARLIER:
+        if name not in result.files:
+            (folder / name).unlink(missing_ok=True)
+    with TemporaryDirectory(prefix=UNFINISHED, dir=folder) as parent:
+        for name in sorted(result.files, key="run.json".__eq__):  # last: if it exists, so do the others
+            partial, file = Path(parent) / "file", folder / name
+            partial.write_bytes(result.files[name])
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(content)
-        if folder.exists():
-            folder.rename(Path(parent) / "before")
-        partial.rename(folder)
+            partial.replace(file)
     return result
 
 

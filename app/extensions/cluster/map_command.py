@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from app.extensions.cluster.many_runs import MappedFiles
 
 FAILED, LEFT_OUT = 1, 3
+_FILES = ("--truth", "--config", "--repairs")  # flags whose value is a file
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -61,13 +62,19 @@ def run(arguments: argparse.Namespace) -> int | None:
         return None
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before a process is started
 
+    from pipeline.io.readers import path_of
+
+    if Path(path_of(arguments.source)).expanduser().resolve() == arguments.out.resolve():
+        raise ParameterError(
+            "the maps would be written among the recordings", where=str(arguments.out), remedy="Name another"
+        )
     from app.common.child_process import usable_cores
     from app.extensions.cluster.many_runs import TABLE, LocalPool, end_processes, map_runs
 
     pool: TaskPool = arguments.pool or LocalPool(min(arguments.jobs or usable_cores(), len(names)))
     others = _other_words(arguments)
     tasks = {
-        folder: [str(Path(arguments.source) / name), *others]
+        folder: [str(Path(path_of(arguments.source)).expanduser().absolute() / name), *others]
         for name, folder in zip(names, _folder_names(names), strict=True)
     }
     try:
@@ -120,8 +127,21 @@ def _other_words(arguments: argparse.Namespace) -> list[str]:
         own.add_argument(flag)
     own.add_argument("--force", action="store_true")
     words = own.parse_known_args(list(arguments.words[1:]))[1]
-    words.remove(arguments.source)
+    del words[_place_of_source(words, arguments.source)]
+    for k, word in enumerate(words):  # a worker has another current folder
+        flag, equals, value = word.partition("=")
+        if flag in _FILES and equals:
+            words[k] = f"{flag}={Path(value).absolute()}"
+        elif k and words[k - 1] in _FILES:
+            words[k] = str(Path(word).absolute())
     return words
+
+
+def _place_of_source(words: Sequence[str], source: str) -> int:
+    """Return the index of the source among words: of equal ones, the last that follows no flag, else the last
+    one."""
+    places = [k for k, word in enumerate(words) if word == source]
+    return next((k for k in reversed(places) if k == 0 or not words[k - 1].startswith("--")), places[-1])
 
 
 def _words_of(result: MappedFiles) -> str:

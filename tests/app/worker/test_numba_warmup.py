@@ -84,7 +84,7 @@ def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
 
     monkeypatch.setattr(numba_warmup, "is_compiled", lambda: False)
     monkeypatch.setattr(numba_warmup, "_start", start)
-    monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
+    monkeypatch.setattr(numba_warmup, "usable_cores", lambda: 2)
     told = []
     with on_compiling(lambda: told.append(1)):
         numba_warmup.compile_ahead()
@@ -103,7 +103,7 @@ def test_the_longest_program_begins_and_the_other_follows_at_the_second_step(mon
     monkeypatch.setattr(numba_warmup, "is_compiled", lambda: False)
     monkeypatch.setattr(numba_warmup, "is_front_end_compiled", lambda: len(started) == 2)
     monkeypatch.setattr(numba_warmup, "_start", start)
-    monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
+    monkeypatch.setattr(numba_warmup, "usable_cores", lambda: 2)
     steps = numba_warmup.compiling()
     assert next(steps) is False
     assert started == ["compile_scans"]
@@ -119,7 +119,7 @@ def test_who_comes_second_waits_and_finds_all_kept(monkeypatch, tmp_path):
     fcntl.flock(first, fcntl.LOCK_EX)
     monkeypatch.setattr(numba_warmup, "is_compiled", lambda: first.closed)
     monkeypatch.setattr(numba_warmup, "_start", lambda half: pytest.fail(half))
-    monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
+    monkeypatch.setattr(numba_warmup, "usable_cores", lambda: 2)
     with on_compiling(first.close):  # the first is done while the second waits
         numba_warmup.compile_ahead()
     assert first.closed
@@ -138,7 +138,7 @@ def test_a_person_who_waits_no_longer_leaves_none_behind(monkeypatch):
 
     monkeypatch.setattr(numba_warmup, "is_compiled", lambda: False)
     monkeypatch.setattr(numba_warmup, "_start", start)
-    monkeypatch.setattr(numba_warmup, "_cores", lambda: 2)
+    monkeypatch.setattr(numba_warmup, "usable_cores", lambda: 2)
     with on_compiling(interrupt), pytest.raises(KeyboardInterrupt):
         numba_warmup.compile_ahead()
     assert None not in [process.returncode for process in started]

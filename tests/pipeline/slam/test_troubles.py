@@ -116,7 +116,7 @@ def assert_survived(name: str, day: Day, *, enough: bool = True) -> None:
     assert lost or error < before + NO_WORSE
     # A fault that lasts makes the map doubtful until its cause is over.
     for _, shown, now, _ in day.since(first + WITHIN):
-        doubtful = not trouble.once and now == "weak" and shown.health.reason.startswith(DOUBTFUL)
+        doubtful = now == "weak" and shown.health.reason.startswith(DOUBTFUL)
         assert lost or now == word or doubtful
     trees = frame.trees.position[frame.trees.confirmed]
     assert day.drive.false_trees(trees, before + (0.0 if lost else error)) <= 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from argparse import Namespace
 from pathlib import Path
 
 import msgspec
@@ -11,6 +12,7 @@ import pytest
 from app.cli import main
 from app.extensions.cluster import many_runs
 from app.extensions.cluster.many_runs import LocalPool, MappedFiles, map_runs
+from app.extensions.cluster.map_command import _other_words
 
 
 def record_runs(folder: Path, number: int) -> Path:
@@ -70,13 +72,17 @@ def test_a_folder_with_the_map_of_another_source_is_kept_unless_forced(tmp_path)
         return map_runs({"a": [source]}, tmp_path, _Pool(1), lambda *_: None, force=force)
 
     assert mapped("first") == [0]
+    (tmp_path / "a" / "notes.txt").write_text("by a person")
+    (tmp_path / "a" / "seen.csv").write_text("of an earlier map")
     assert mapped("first") == [0]
+    assert not (tmp_path / "a" / "seen.csv").exists()
     assert mapped("second") == [1]
     assert "another source" in rows_of(tmp_path)["a"]["message"]
     assert (tmp_path / "a" / "words.txt").read_text() == '["first"]'
     assert mapped("second", force=True) == [0]
     assert (tmp_path / "a" / "words.txt").read_text() == '["second"]'
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "runs.csv"]
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["notes.txt", "run.json", "words.txt"]
 
 
 def test_a_process_that_dies_is_a_failed_run(tmp_path, monkeypatch):
@@ -90,3 +96,17 @@ def test_a_process_that_dies_is_a_failed_run(tmp_path, monkeypatch):
 def test_flags_of_many_runs_are_refused_for_one(tmp_path, capsys, flag):
     assert main(["map", "sim:stand", "--out", str(tmp_path / "out"), *flag]) == 2
     assert "for a folder of several runs" in capsys.readouterr().err
+
+
+def test_maps_are_not_written_among_the_recordings(tmp_path, capsys):
+    (tmp_path / "a.mcap").touch()
+    (tmp_path / "b.mcap").touch()
+    assert main(["map", str(tmp_path), "--out", str(tmp_path / "x" / "..")]) == 2
+    assert "among the recordings" in capsys.readouterr().err
+
+
+def test_a_value_that_is_equal_to_the_source_stays_with_its_flag():
+    words = ["--preset", "forest", "--seed", "3", "forest", "--truth=true.csv"]
+    arguments = Namespace(words=["map", *words, "--out", "maps"], source="forest")
+    found = _other_words(arguments)
+    assert found == ["--preset", "forest", "--seed", "3", f"--truth={Path('true.csv').absolute()}"]

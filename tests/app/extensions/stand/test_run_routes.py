@@ -81,7 +81,7 @@ async def test_maps_that_do_not_fit_are_compared_without_alignment(tmp_path: Pat
         for a, b, statuses in (("few", "other", ["same", "new"]), ("none", "few", ["new"])):
             query = {"a": f"folder:{a}", "b": f"folder:{b}"}
             told = (await client.get("/api/runs/compare", params=query)).json()
-            assert told["how"].startswith("not aligned: the stems of the two visits do not agree")
+            assert told["how"].startswith("not aligned: the stems of the two maps do not agree")
             assert not told["aligned"]
             assert [row["status"] for row in told["rows"]] == statuses
 
