@@ -242,15 +242,6 @@ def test_the_map_dims_the_trees_that_the_filter_leaves_out(dashboard: Dashboard)
     assert drawn("") == whole
 
 
-def test_the_filter_ends_with_the_run(dashboard: Dashboard):
-    page = dashboard.page
-    dashboard.tab("Trees")
-    page.locator("#find").fill("dbh > 1000")
-    expect(page.locator("#tree-count")).to_contain_text("0 of")
-    dashboard.open("sim:stand?duration=3")
-    expect(page.locator("#find")).to_have_value("")
-
-
 def test_the_head_of_the_table_and_the_map_tell_what_lacks_for_a_diameter(dashboard: Dashboard):
     dashboard.stand(5.05)
     dashboard.tab("Trees")
@@ -262,3 +253,12 @@ def test_the_head_of_the_table_and_the_map_tell_what_lacks_for_a_diameter(dashbo
     entry = dashboard.page.locator("#legend-unseen").bounding_box()
     assert entry is not None
     assert entry["width"] > 60
+
+
+def test_the_filter_ends_with_the_run(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    page.locator("#find").fill("dbh > 1000")
+    expect(page.locator("#tree-count")).to_contain_text("0 of")
+    dashboard.open("sim:stand?duration=3")
+    expect(page.locator("#find")).to_have_value("")

@@ -83,7 +83,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     expect(whole.locator("summary")).to_contain_text("change")
     assert whole.get_attribute("open") is None  # the list would take the place of the sliders
     whole.locator("summary").click()
-    assert page.locator("#map").bounding_box()["height"] > 50  # type: ignore[index]
+    assert page.locator("#scene").bounding_box()["height"] > 200  # type: ignore[index]
     rows = page.locator("#tune-changes li[data-kind=vanished]")
     assert rows.count() >= known - fewer
     expect(rows.first).to_contain_text("votes for a tree")
