@@ -72,8 +72,11 @@ def with_loops(graph: KeyframeGraph, path: Path, repairs: tuple[Repair, ...]) ->
     problems, ties = list[str](), 0
     # Forbidden loops first: an added one is always among the last, which have no kernel.
     for repair in sorted(repairs, key=lambda each: each.kind == "tie"):
-        if len(graph.keyframes) < 2 or repair.stamps_ns[1] > path.stamp_ns[-1]:
+        if len(graph.keyframes) < 2 or max(repair.stamps_ns) > path.stamp_ns[-1]:
             problems.append("the run has not come to this place yet")
+            continue
+        if min(repair.stamps_ns) < path.stamp_ns[0]:
+            problems.append("the run begins after this place")
             continue
         ends = [_keyframe(graph, path, stamp) for stamp in repair.stamps_ns]
         if ends[0] == ends[1]:

@@ -24,6 +24,10 @@ PLACES: Mapping[Kind, int] = {
     "merge": 2, "split": 2, "move": 2, "class": 1, "delete": 1, "tie": 2, "forbid": 0,
 }  # fmt: skip
 MOST = 1000
+#: Largest |x| and |y| of a position [m]: northings of UTM are at most 1e7.
+FARTHEST = 1e7
+#: Times are int64.
+LATEST_NS = 2**63
 
 
 class Repair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,6 +63,10 @@ class Repair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return f"{self.kind} needs {PLACES[self.kind]} positions"
         if len(self.stamps_ns) != (2 if self.is_of_loop else 0):
             return f"{self.kind} needs {2 if self.is_of_loop else 0} times"
+        if any(not abs(v) <= FARTHEST for place in self.places for v in place):
+            return f"a position is farther than {FARTHEST:.0f} m"
+        if any(not 0 <= stamp < LATEST_NS for stamp in self.stamps_ns):
+            return "a time is not between 0 and 2^63 ns"
         if (self.value in CLASSES) != (self.kind == "class"):
             return f"the class of {self.kind} is {self.value or 'missing'}"
         return ""
@@ -84,7 +92,7 @@ def parse_repairs(text: str, where: str) -> tuple[Repair, ...]:
     try:
         given: dict[str, Any] = json.loads(text)
         repairs = msgspec.convert(given["repairs"], tuple[Repair, ...])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         raise SourceError(f"these are no repairs of a map: {error}", where=where, remedy=remedy) from None
     if len(repairs) > MOST:
         raise SourceError(f"there are more than {MOST} repairs", where=where)

@@ -106,6 +106,8 @@ class Repairer:
         if self._known is not None:
             of, graph, path, fixed = self._known
             slow = hurried and len(run.graph.keyframes) < (1.0 + GROWN) * len(graph.keyframes)
+            # A loop that the mapper closed meanwhile has changed the path, to which no correction is known.
+            slow = slow and np.array_equal(loops_of(graph), loops_of(run.graph))
             ends = max(stamp for repair in repairs for stamp in repair.stamps_ns)
             reached = ends <= path.stamp_ns[-1] or ends > run.path.stamp_ns[-1]
             if of == repairs and len(path.x) <= len(run.path.x) and reached and (graph is run.graph or slow):
@@ -156,7 +158,7 @@ def _moved_trees(run: MapOfRun, correction: PathCorrection) -> Trees:
     flat = rotated_rows(trees.covariance[:, [0, 0, 1], [0, 1, 1]], turn)
     covariance = flat[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     moved = replace(trees, position=position, covariance=covariance)
-    return _with_separated(_joined(moved), others, stamps)
+    return _with_separated(_joined(moved, trees.position), others, stamps)
 
 
 def _detections(graph: KeyframeGraph, poses: Float) -> tuple[Int, Float, Int]:
@@ -174,9 +176,15 @@ def _most(place: Float) -> Bool:
     return found
 
 
-def _joined(trees: Trees) -> Trees:
+def _joined(trees: Trees, before: Float) -> Trees:
     """Return the trees in which those at one place are merged, the one that was seen first with the other
-    one: within OF_STEM, or within TWICE if one was left before the other one was seen."""
+    one: within OF_STEM if they were not so near before, or within TWICE if one was left before the other one
+    was seen.
+
+    Args:
+        trees: The trees after the repair.
+        before: Their positions before it, shape (T, 2) [m].
+    """
     from scipy.spatial import cKDTree
 
     rows = np.flatnonzero(trees.confirmed)
@@ -185,7 +193,8 @@ def _joined(trees: Trees) -> Trees:
     later = trees.first_seen_ns[a] > trees.first_seen_ns[b]
     a, b = np.where(later, b, a), np.where(later, a, b)
     away = np.hypot(*(trees.position[a] - trees.position[b]).T)
-    same = (away <= OF_STEM) | (trees.last_seen_ns[a] < trees.first_seen_ns[b])
+    came_near = np.hypot(*(before[a] - before[b]).T) > OF_STEM  # else the mapper has seen two stems there
+    same = ((away <= OF_STEM) & came_near) | (trees.last_seen_ns[a] < trees.first_seen_ns[b])
     taken, into, others = set[int](), list[int](), list[int]()
     for k in np.flatnonzero(same)[np.argsort(away[same], kind="stable")].tolist():
         pair = {int(a[k]), int(b[k])}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -11,9 +11,10 @@ import pytest
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.repairs.record import Kind, Repair, parse_repairs, repairs_text, seen_from
-from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer
+from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer, _joined
 from pipeline.types.records import Float
 from tests.benchmarks.wide_ring import NS, WideRing, mapped
+from tests.pipeline import strategies
 
 STEMS = preset("stems")
 POLES = np.array([[8.0, 3.0], [16.0, -2.5], [22.0, 10.0]])
@@ -189,6 +190,24 @@ def test_the_end_of_a_playing_run_has_the_map_of_a_run_that_did_not_play():
     np.testing.assert_array_equal(one.position, other.position)
 
 
+def test_a_loop_that_the_mapper_closed_meanwhile_makes_the_repair_anew():
+    of, _ = run(0, "constellation")
+    assert of.graph.loops
+    open_ring = replace(of, graph=replace(of.graph, loops=()))
+    ties = [repair for repair in repaired(0).repairs if repair.kind == "tie"]
+    playing = Repairer()
+    playing.repaired(open_ring, ties)
+    hurried = playing.repaired(of, ties, hurried=True).path
+    np.testing.assert_array_equal(hurried.x, Repairer().repaired(of, ties).path.x)
+
+
+def test_only_trees_that_a_repair_brought_together_are_merged():
+    near = strategies.trees([[0.0, 0.0], [0.4, 0.0], [9.0, 0.0]])
+    moved = replace(near, position=near.position * [[1.0, 1.0], [1.0, 1.0], [0.02, 1.0]])
+    np.testing.assert_array_equal(_joined(near, near.position).number, near.number)
+    assert len(_joined(moved, near.position).number) == 2
+
+
 def test_repairs_without_their_trees_or_places_say_so():
     of, _ = run(0)
     later = int(of.path.stamp_ns[-1]) + NS
@@ -197,10 +216,14 @@ def test_repairs_without_their_trees_or_places_say_so():
         Repair("tie", ((1.0, 0.0), (1.0, 0.0)), (1, later)),
         Repair("forbid", stamps_ns=(1, int(of.path.stamp_ns[-1]))),
         Repair("class", ((500.0, 0.0),), value="tree"),
+        Repair("tie", ((1.0, 0.0), (1.0, 0.0)), (later, 1)),
+        Repair("forbid", stamps_ns=(int(of.path.stamp_ns[0]) - 1, int(of.path.stamp_ns[-1]))),
     ]
     found = Repairer().repaired(of, repairs)
     assert "no tree is within" in found.problems[0]
     assert "not come to this place" in found.problems[1]
     assert "no loop between" in found.problems[2]
     assert "no candidate is within" in found.problems[3]
+    assert "not come to this place" in found.problems[4]
+    assert "begins after this place" in found.problems[5]
     assert len(found.frame.trees.number) == len(of.frame.trees.number)
