@@ -37,7 +37,7 @@ from pipeline.io.result_files import (
     terrain_rows,
     tree_rows,
 )
-from pipeline.repairs.record import Repair, repairs_record
+from pipeline.repairs.record import repairs_record
 from pipeline.seen_area import SeenArea, SeenRecorder, covered_area
 from pipeline.types.records import Path, Trees, TruthTrees
 
@@ -62,7 +62,6 @@ class ShownRun:
         edits: The annotations, also those of skipped trees and of extensions.
         frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
             none.
-        repairs: The repairs of the map, which `shown` has, with the reasons why some do not apply.
     """
 
     request: SourceRequest
@@ -77,7 +76,6 @@ class ShownRun:
     seen: SeenRecorder
     edits: tuple[Annotation, ...]
     frame: Annotation | None
-    repairs: tuple[Repair, ...] = ()
 
     @classmethod
     def of(cls, dashboard: Dashboard) -> ShownRun:
@@ -98,7 +96,6 @@ class ShownRun:
             dashboard.seen,
             (*editor.rows, *editor.skipped, *editor.others),
             editor.frame,
-            editor.repairs,
         )
 
     @property
@@ -194,8 +191,8 @@ class ShownRun:
             if self.one_step.crs_unit != (1.0, 1.0):
                 source["crs_unit_m"] = list(self.one_step.crs_unit)
         repairs = {}
-        if self.repairs and len(self.repairs) == len(self.shown.problems):
-            repairs = {"repairs": repairs_record(self.repairs, self.shown.problems)}
+        if self.shown.repairs:
+            repairs = {"repairs": repairs_record(self.shown.repairs, self.shown.problems)}
         return {
             "stemmap": version(),
             "source": source,

@@ -282,7 +282,7 @@ class WorkerLoop:
                 self._play()
             case protocol.Pause():
                 self._held = True
-                session.pause()
+                self._show(session.pause())
             case protocol.Advance(scans=scans):
                 self._held = True
                 self._show(session.advance(scans))
@@ -423,6 +423,7 @@ class WorkerLoop:
                     odometry_xy,
                     () if repaired is None else repaired.problems,
                     session.loops,
+                    () if repaired is None else session.repairs,
                 )
             )
 

@@ -243,6 +243,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         counts: Counts up to this scan; None if they are unknown.
         problems: Why each of the repairs of `SetRepairs` does not apply; "" if it does.
         loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
+        repairs: The repairs to which `problems` belongs.
     """
 
     run: int
@@ -255,6 +256,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     odometry_xy: Float = msgspec.field(default_factory=lambda: np.zeros((0, 2)))
     problems: tuple[str, ...] = ()
     loops: Int = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    repairs: tuple[Repair, ...] = ()
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):

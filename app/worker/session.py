@@ -6,6 +6,8 @@ It has no thread, socket or clock; the loop of the worker reads `pace` and calls
 from __future__ import annotations
 
 import math
+import sys
+import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -97,7 +99,9 @@ class Session:
         self._comparison = MapComparison()
         self._repairs: tuple[Repair, ...] = ()
         self._repairer = Repairer()
-        self._repaired: tuple[Frame, RepairedMap] | None = None  # of the frame before the repairs
+        #: Frame before the repairs, whether its loops were repaired by an earlier solution, and the map.
+        self._repaired: tuple[Frame, bool, RepairedMap] | None = None
+        self._faults: dict[str, None] = {}  # of the repairs, that were printed
         self._remaps_on_arrival = False
         self._warnings: dict[str, None] = {}
         self.on_preview: Callable[[int, Trees], None] = lambda _revision, _trees: None
@@ -128,23 +132,45 @@ class Session:
     @property
     def repaired(self) -> RepairedMap | None:
         """The map with the repairs; None without repairs, and without a map. While the run plays or a scan is
-        sought, loops are repaired by an earlier solution."""
+        sought, loops are repaired by an earlier solution. If the repairs fail, the map is without them, and
+        the error is the problem of each."""
         shown, run = self._kept or self._run, self._run
         if not self._repairs or shown is None or shown.frame is None or run is None:
             return None
-        if self._repaired is not None and self._repaired[0] is shown.frame:
-            return self._repaired[1]
+        hurried = self._is_hurried
+        if self._repaired is not None and self._repaired[0] is shown.frame and self._repaired[1] <= hurried:
+            return self._repaired[2]
         of_drive = isinstance(run, Run) and self._kept is None
         graph, landmarks = KeyframeGraph(), np.full(len(shown.frame.trees.number), -1)
         if isinstance(run, Run) and of_drive:
             graph, landmarks = run.graph, run.tree_landmarks
-        found = self._repairer.repaired(
-            MapOfRun(shown.frame, shown.path, graph, landmarks),
-            self._repairs,
-            hurried=self._state == "playing" or self._target.sought,
-        )
-        self._repaired = (shown.frame, found)
+        of_run = MapOfRun(shown.frame, shown.path, graph, landmarks)
+        try:
+            found = self._repairer.repaired(of_run, self._repairs, hurried=hurried)
+        except (ValueError, ArithmeticError, IndexError) as error:  # LinAlgError is a ValueError
+            fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
+            if fault not in self._faults:
+                self._faults[fault] = None
+                traceback.print_exc(file=sys.stderr)
+            problems = (fault,) * len(self._repairs)
+            found = RepairedMap(shown.frame, shown.path, problems, loops_of(graph), None)
+        self._repaired = (shown.frame, hurried, found)
         return found
+
+    @property
+    def repairs(self) -> tuple[Repair, ...]:
+        """The repairs of the map."""
+        return self._repairs
+
+    @property
+    def _is_hurried(self) -> bool:
+        """Whether loops are repaired by an earlier solution."""
+        is_on_way = self._state == "playing" or self._target.sought
+        return is_on_way and any(repair.is_of_loop for repair in self._repairs)
+
+    def _forget_repaired(self) -> None:
+        """Repair the map anew, because the run has another one."""
+        self._repairer, self._repaired = Repairer(), None
 
     @property
     def loops(self) -> Int:
@@ -178,7 +204,9 @@ class Session:
     def set_repairs(self, repairs: tuple[Repair, ...]) -> Frame | None:
         """Set the repairs of the map and return the frame of the current scan with them; None before the
         first scan."""
-        self._repairs, self._repaired = repairs, None
+        self._repairs, self._repaired, self._faults = repairs, None, {}
+        if any(repair.is_of_loop for repair in repairs):
+            self._kept = None  # its graph is not stored, see `_show_kept`
         return self.frame
 
     @property
@@ -395,10 +423,17 @@ class Session:
             self._state, self._detail = "playing", ""
         return opened
 
-    def pause(self) -> None:
-        """Pause if the run plays; while seeking, pause once the target is reached. Other states stay."""
+    def pause(self) -> Frame | None:
+        """Pause if the run plays; while seeking, pause once the target is reached. Other states stay.
+
+        Returns:
+            The current scan if its loops were repaired by an earlier solution and are now by their own; else
+            None.
+        """
+        was_hurried = self._is_hurried
         if self._state == "playing":
             self._state = "paused"
+        return self.frame if was_hurried and not self._is_hurried else None
 
     def advance(self, scans: int) -> Frame | None:
         """Pause and seek a number of scans forward, or back if it is negative, from the sought scan if its
@@ -468,6 +503,7 @@ class Session:
         if run is None:
             return None
         run.cancel_remapping()
+        self._forget_repaired()
         if self._target.sought:  # see `_arrive`
             self._remaps_on_arrival = whole
             return None
@@ -505,6 +541,7 @@ class Session:
         if done is None:
             return None
         frame, confirmed_s = done
+        self._forget_repaired()
         frame = self.frame or frame
         changes = self._comparison.changes(shown, frame, self._revision, self.time_s, confirmed_s)
         if self._robot is not None:
@@ -559,7 +596,8 @@ class Session:
         self._warnings.clear()
         self._target.forget()
         self._kept = None
-        self._repairs, self._repairer, self._repaired = (), Repairer(), None
+        self._repairs, self._faults = (), {}
+        self._forget_repaired()
 
     def end_recording(self) -> bool:
         """Finish the recording of a live run, which waits up to 8 s for the disk, and return whether the run

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,6 +17,8 @@ from app.worker.protocol import Open, Status
 from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
+from pipeline.repairs.record import Repair
+from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer
 from pipeline.types.records import Frame, Step
 from tests.app.fakes import FakeMapper, FakeSource, make_session, scan
 
@@ -516,3 +519,81 @@ def test_a_source_without_a_mapper_is_closed() -> None:
     with pytest.raises(StemmapError, match="oak"):
         Session(lambda *_: source, refuses, Parameters()).open(Open("fake:"))
     assert source.closed
+
+
+TIE = Repair("tie", ((1.0, 0.0), (1.0, 0.0)), (0, 1))
+
+
+@pytest.mark.parametrize("error", [ValueError, ZeroDivisionError, np.linalg.LinAlgError, IndexError])
+def test_a_fault_in_a_repair_is_its_problem_and_the_map_is_shown_without_it(
+    monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+) -> None:
+    session = opened()
+    session.advance(3)
+    settle(session)
+    before = session.frame
+
+    def failing(*_: Any, **__: Any) -> RepairedMap:
+        raise error("singular")
+
+    monkeypatch.setattr(Repairer, "repaired", failing)
+    assert session.set_repairs((TIE,)) is before
+    assert session.repaired is not None
+    assert "singular" in session.repaired.problems[0]
+    assert session.status().scan_index == 2
+
+
+def noted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Repairer, bool]]:
+    """Return a list to which each repair appends its `Repairer` and whether it was hurried."""
+    calls: list[tuple[Repairer, bool]] = []
+    repaired = Repairer.repaired
+
+    def noting(self: Repairer, run: MapOfRun, repairs: Any, *, hurried: bool = False) -> RepairedMap:
+        calls.append((self, hurried))
+        return repaired(self, run, repairs, hurried=hurried)
+
+    monkeypatch.setattr(Repairer, "repaired", noting)
+    return calls
+
+
+def test_a_pause_repairs_the_loops_of_the_shown_scan_by_their_own_solution(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    session, calls = opened(), noted(monkeypatch)
+    session.play()
+    session.work()
+    session.set_repairs((TIE,))
+    before = calls[-1]
+    assert session.pause() is session.frame
+    assert (before[1], calls[-1][1]) == (True, False)
+    assert session.pause() is None, "it is shown already"
+
+
+def test_the_last_scan_of_a_played_run_has_its_own_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    session, calls = opened(3), noted(monkeypatch)
+    session.set_repairs((TIE,))
+    session.play()
+    while session.pace != "idle":
+        session.work()
+        assert session.frame is not None
+    assert not calls[-1][1]
+
+
+def test_other_parameters_repair_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    session, calls = opened(), noted(monkeypatch)
+    session.advance(3)
+    settle(session)
+    session.set_repairs((TIE,))
+    session.set_parameters(parameters(0.5), 1)
+    assert session.frame is not None
+    assert calls[0][0] is not calls[-1][0]
+
+
+def test_a_tie_acts_while_a_stored_scan_is_shown() -> None:
+    session = opened()
+    session.seek(12.0)
+    settle(session)
+    session.seek(1.0)
+    before = session.is_shown
+    session.set_repairs((TIE,))
+    assert (before, session.is_shown) == (True, False)
