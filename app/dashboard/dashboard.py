@@ -377,7 +377,9 @@ class Dashboard:
             self._notice = "The mapping process ended and was started again. Press play to start again"
         self._go = False
         state, self._repairs_sent = self.parameters, ()
-        await self._send_repairs()
+        # A worker that does not read in time must not keep the run from its beginning.
+        with contextlib.suppress(protocol.WorkerBusyError):
+            await self._send_repairs()
         # Always with the parameters: those sent for a run that was left since did not reach the worker.
         await self.worker.send(
             protocol.Begin(opened.run, state.parameters.model_dump(), state.revision, play)
@@ -415,8 +417,9 @@ class Dashboard:
             repairs, run = self.annotation_editor.repairs, self.run
             if run is None or repairs == self._repairs_sent:
                 return
-            self._repairs_sent = repairs
             await self.worker.send(protocol.SetRepairs(run, repairs))
+            if run == self.run:  # else another run was opened meanwhile
+                self._repairs_sent = repairs
 
     def _use_truth(self) -> None:
         """Show the ground truth with the annotations in scene and browsers, and request the score of the map

@@ -45,6 +45,8 @@ async def add(body: _Add, dashboard: Dash) -> Response:
     """Add a repair; return its number (`id`) and the counts of edits, see `edited`, with 201. 409 before the
     first map or if another run was opened meanwhile, 422 for a repair that is not valid, and for a tie of a
     position without a tree."""
+    if len(dashboard.annotation_editor.repairs) >= MOST:
+        raise BadRequestError(f"a run can have at most {MOST} repairs")
     (added,) = await apply_edit(dashboard, body, Store.add, [_content(_repair(body, dashboard))])
     return await edited(dashboard, body, {"id": added}, 201)
 

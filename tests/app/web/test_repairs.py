@@ -7,8 +7,12 @@ import json
 from typing import Any
 
 import httpx
+import msgspec
+import pytest
 
-from app.worker.protocol import SetRepairs
+from app.dashboard.shown_run import ShownRun
+from app.worker.protocol import SetRepairs, WorkerBusyError
+from pipeline.repairs.record import Repair
 from tests.app.dashboard.test_annotations import ANN, edit, show, until
 from tests.app.fakes import FakeWorker
 from tests.app.server_for_tests import BEARER, running
@@ -73,6 +77,55 @@ async def test_repairs_that_are_not_valid_are_refused() -> None:
             {"kind": "burn", "places": [[0.0, 0.0]]},
         ):
             assert (await repair(client, **body)).status_code == 422, body
+
+
+async def test_more_repairs_than_a_run_can_have_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("app.web.routes.repairs.MOST", 1)
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        assert (await repair(client, kind="delete", places=[[1.0, 2.0]])).status_code == 201
+        refused = await repair(client, kind="delete", places=[[3.0, 2.0]])
+        assert refused.status_code == 422
+        assert "at most 1 repairs" in refused.json()["error"]["what"]
+
+
+async def test_repairs_that_a_busy_worker_did_not_take_are_sent_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        await repair(client, kind="delete", places=[[1.0, 2.0]])
+        await until(lambda: len(sent(dashboard.worker)) == 1)
+        take = dashboard.worker.send
+
+        async def busy(command: Any) -> None:
+            if isinstance(command, SetRepairs):
+                raise WorkerBusyError("the mapping process is busy")
+            await take(command)
+
+        monkeypatch.setattr(dashboard.worker, "send", busy)
+        dashboard._repairs_sent = ()
+        with pytest.raises(WorkerBusyError):
+            await dashboard._send_repairs()
+        monkeypatch.undo()
+        assert isinstance(dashboard.worker, FakeWorker)
+        dashboard.worker.commands.clear()
+        await dashboard._send_repairs()
+        assert len(sent(dashboard.worker)) == 1
+
+
+async def test_a_saved_run_records_the_repairs_that_its_map_has() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        assert dashboard.shown is not None
+        of_map = (Repair("delete", ((1.0, 2.0),)),)
+        dashboard.shown = msgspec.structs.replace(dashboard.shown, repairs=of_map, problems=("",))
+        await repair(client, kind="move", places=[[1.0, 2.0], [2.0, 2.0]])
+        record = json.loads(ShownRun.of(dashboard).texts()["run.json"])
+        assert record["repairs"] == {"applied": {"delete": 1}, "not_applied": []}
 
 
 async def test_saved_repairs_are_imported_once() -> None:
