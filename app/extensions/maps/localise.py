@@ -25,7 +25,7 @@ from pipeline.slam.frame_uncertainty import transported_covariance
 from pipeline.types.records import Bool, Frame, HeightMap, Path
 
 TERRAIN_REACH = 20.0  # m around the robot; more of the local terrain is not compared
-SEEN_REACH = 15.0  # m; a place counts as observed up to this distance, as for stand figures
+SEEN_REACH = 15.0  # m; a place counts as observed up to this distance
 MATCH = 1.0  # m; largest distance of the two positions of a tree
 DBH_SIGMA = 0.01  # m, of a diameter without a standard deviation
 _POSE = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")
