@@ -28,7 +28,8 @@ WORDS = {
     "dds": r"\bdds:|DdsLink|cyclone|plain DDS|fast_?dds",
     "fleet": r"fleet|robots-link|common.map",
     "formats": r"victoria",
-    "maps": r"--continue|ContinuedMap|continue_map|merge_runs|stemmap merge|merged_map|stemmap localise|/api/localise|\"localise\"|Locate in",
+    "maps": r"--continue|ContinuedMap|continue_map|merge_runs|stemmap merge|merged_map|stemmap localise|"
+    r"/api/localise|\"localise\"|Locate in",
     "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
     # georeference.json has the reference system of a map, which the core reads for its files.
     "stand": r"sample.?plot|stand.figure|georeferenc(?!e\.json)|/api/plots|runs/compare|[a-z]-plots\b|"
