@@ -38,13 +38,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--grow",
         action="store_true",
-        help="add the trees of this run to the map in --map if the robot is found (default: none are added)",
+        help="add the trees of this run to the map in --map if the exit code is 0 (default: none are added)",
     )
     parser.epilog = (
         "Prints when and where the robot is found. Writes to --out the files of `stemmap map`, and\n"
         "poses.csv and map_odom.csv (in the stored map), trees_in_map.csv (same, missing and new trees,\n"
-        "growth) and localisation.json. Exit code 3: not found at the end, or a place was withdrawn\n"
-        "because the stems contradicted it."
+        "growth) and localisation.json. Exit code 3: not found at the end, a place was withdrawn because\n"
+        "the stems contradicted it, the map of this run is doubtful, or messages or points were left\n"
+        "out; nothing is added to the map then."
     )
 
 
@@ -53,8 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Map a run and localise it in the stored map; print what is found.
 
     Returns:
-        Exit code: 3 if the robot is not found at the end, a fix was withdrawn, or messages or points were
-        left out; else 0.
+        Exit code: 3 if the robot is not found at the end, a fix was withdrawn, the map of the run is
+        doubtful, or messages or points were left out; else 0.
 
     Raises:
         StemmapError: The map or the source cannot be read, or the arguments contradict each other.
@@ -62,6 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
     """
     _, parameters = flags.chosen_parameters(arguments, "forest")
 
+    from app.batch.map_run import WRONG
+    from app.batch.summary import exit_code
     from app.cli.map import map_to
     from app.extensions.maps.localise import (
         LocalisedRun,
@@ -72,15 +75,19 @@ def run(arguments: argparse.Namespace) -> int:
         write_localised,
     )
     from app.extensions.maps.stored_map import read_stored_map
-    from pipeline.errors import StemmapError
+    from pipeline.errors import ParameterError, StemmapError
 
     stored = read_stored_map(arguments.stored)
     if not len(stored):
         raise StemmapError("the map has no trees", where=str(arguments.stored))
     if arguments.grow:
         from app.batch.saved_run import read_saved_run
+        from app.extensions.maps.merge import check_unrepaired
 
+        if arguments.repairs:
+            raise ParameterError("a run with repairs cannot be added to a map", remedy="Remove --repairs")
         read_saved_run(arguments.stored)  # a file of `pack`, or a map without its state, cannot grow
+        check_unrepaired(arguments.stored)
     localised = LocalisedRun(stored, parameters.relocalisation.slack)
 
     def on_scan(frame: Frame, mapper: Mapper, live: LiveSource | None) -> None:
@@ -105,12 +112,15 @@ def run(arguments: argparse.Namespace) -> int:
         if keep:
             write_localised(localised, done, arguments.out)
             print(f"files in {arguments.out}")
-        if arguments.grow:
+        code = exit_code(outcome.warnings, outcome.losses, WRONG) if is_reliable(localised) else 3
+        if arguments.grow and not code:
             _grow(arguments, localised)
+        elif arguments.grow:
+            print("the map stays as it is, because the place or the map of this run is not certain")
     flags.print_warnings(outcome.warnings)
     for reason, number in outcome.losses.items():
         print(f"left out: {reason} ({number:,})", file=sys.stderr)
-    return 0 if is_reliable(localised) and not outcome.losses else 3
+    return code
 
 
 def _print_event(run: LocalisedRun) -> None:
@@ -154,18 +164,14 @@ def _summary(run: LocalisedRun) -> list[str]:
 
 
 def _grow(arguments: argparse.Namespace, localised: LocalisedRun) -> None:
-    """Merge the run into the stored map, if it is found and no fix was withdrawn.
+    """Merge the run into the stored map.
 
     Raises:
         StemmapError: A run cannot be read.
         OSError: The folder of the map cannot be written.
     """
-    from app.extensions.maps.localise import is_reliable
     from app.extensions.maps.merge import merge_runs
 
-    if not is_reliable(localised):
-        print("the map stays as it is, because the place is not certain")
-        return
     done = merge_runs(
         arguments.stored, arguments.out, arguments.stored, None, force=False, match=localised.localiser.match
     )

@@ -64,13 +64,15 @@ def merge_runs(
         Numbers of confirmed trees, and the match of the maps.
 
     Raises:
-        StemmapError: A run cannot be read, the two maps do not match with confidence, or `out` has the map of
-            another source.
+        StemmapError: A run cannot be read or has repairs, the two maps do not match with confidence, or `out`
+            has the map of another source.
         OSError: The folder cannot be written; it is unchanged then.
     """
     a, b = read_saved_run(folder_a), read_saved_run(folder_b)
     chosen = a.chosen_parameters() if parameters is None else parameters
     record = read_run_record(folder_a)
+    check_unrepaired(folder_a)
+    check_unrepaired(folder_b)
     check_folder(out, a.sources[0].digest, force=force)
     trees_a, trees_b = a.map.trees(chosen), b.map.trees(b.chosen_parameters())
     if match is None:
@@ -106,6 +108,20 @@ def merge_runs(
         files.finish(trees, path, a.start_ns, record, saved.as_bytes(), more)
     both = sum(1 for row in table if row[1] and row[2])
     return MergeResult(sum(1 for row in table if row[1]), sum(1 for row in table if row[2]), both, match)
+
+
+def check_unrepaired(folder: FilePath) -> None:
+    """Refuse a run with repairs: its saved state, which is merged, is without them.
+
+    Raises:
+        StemmapError: The run has repairs, or its run.json is damaged.
+    """
+    if read_run_record(folder).get("repairs"):
+        raise StemmapError(
+            "its map has repairs, and a merged map would lose them",
+            where=str(folder),
+            remedy="Map the run again without --repairs, merge, and repair the merged map",
+        )
 
 
 def _joined(

@@ -101,6 +101,41 @@ def test_a_map_grows_only_on_demand(stand, tmp_path, capsys):
     assert rows(grown / "trees.csv") == after
 
 
+def test_a_doubtful_map_is_not_added_and_said(stand, tmp_path, capsys, monkeypatch):
+    import shutil
+
+    from app.batch.map_run import WRONG
+    from app.cli import map as map_command
+
+    map_to = map_command.map_to
+
+    def doubtful(*arguments):
+        outcome, replaces = map_to(*arguments)
+        outcome.warnings.append(f"{WRONG[0]} since 3 s")
+        return outcome, replaces
+
+    grown = tmp_path / "map"
+    shutil.copytree(stand, grown)
+    monkeypatch.setattr(map_command, "map_to", doubtful)
+    assert main(["localise", AGAIN, "--map", str(grown), "--grow"]) == 3
+    assert "the map stays as it is" in capsys.readouterr().out
+    assert contents(grown) == contents(stand)
+
+
+def test_a_map_with_repairs_does_not_grow(stand, tmp_path, capsys):
+    import shutil
+
+    repaired = tmp_path / "map"
+    shutil.copytree(stand, repaired)
+    record = json.loads((stand / "run.json").read_text(encoding="utf-8"))
+    record["repairs"] = {"applied": {"loop": 1}, "not_applied": []}
+    (repaired / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    assert main(["localise", AGAIN, "--map", str(repaired), "--grow"]) == 1
+    assert "its map has repairs" in capsys.readouterr().err
+    assert main(["localise", AGAIN, "--map", str(stand), "--grow", "--repairs", "repairs.json"]) == 2
+    assert "Remove --repairs" in capsys.readouterr().err
+
+
 def test_what_is_no_map_is_refused(tmp_path, capsys):
     assert main(["localise", AGAIN, "--map", str(tmp_path / "none")]) == 1
     assert "there is no map" in capsys.readouterr().err

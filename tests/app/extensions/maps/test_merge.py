@@ -141,6 +141,19 @@ def test_a_run_without_a_state_is_refused(runs, tmp_path, capsys):
     assert "no saved state" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("repaired", ["a", "b"])
+def test_a_run_with_repairs_is_refused(repaired, runs, tmp_path, capsys):
+    folder = {name: runs / name for name in ("a", "b")}
+    folder[repaired] = tmp_path / repaired
+    shutil.copytree(runs / repaired, folder[repaired])
+    record = json.loads((runs / repaired / "run.json").read_text())
+    record["repairs"] = {"applied": {"loop": 1}, "not_applied": []}
+    (folder[repaired] / "run.json").write_text(json.dumps(record))
+    assert main(["merge", str(folder["a"]), str(folder["b"]), "--out", str(tmp_path / "out")]) == 1
+    assert "its map has repairs" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_damaged_detections_are_refused(runs, tmp_path, capsys):
     shutil.copytree(runs / "b", tmp_path / "b")
     with (tmp_path / "b" / "detections.csv").open("a", encoding="utf-8") as file:
