@@ -21,7 +21,7 @@ from scipy.stats import binom
 
 from pipeline.geometry.poses import Float, Pose2, Pose3
 from pipeline.localisation.heights import HeightFix, align_heights
-from pipeline.localisation.search import Fix, MapIndex, false_alarms, fix_near, search_map
+from pipeline.localisation.search import SIGMA_XY, Fix, MapIndex, false_alarms, fix_near, search_map
 from pipeline.localisation.stored_map import StoredMap
 from pipeline.loop_closure.stem_matching import MapStems, Match, worst_sigma
 from pipeline.slam.places import AGREEING, ODDS
@@ -204,7 +204,7 @@ class Localiser:
                     self.localisation, state=State.SEARCHING, searches=k, reason="the stems in view disagree"
                 )
             return
-        absent = _would_be_found(fix, len(stems), level)
+        absent = _would_be_found(fix, len(stems), len(index.stems), level)
         state = State.ABSENT if absent else State.SEARCHING
         self.localisation = replace(self.localisation, state=state, searches=k, reason=fix.reason or "")
 
@@ -217,15 +217,8 @@ class Localiser:
             return
         agreeing = len(fix.local) >= AGREEING * fix.inside  # as for a new fix
         if not agreeing or _log_odds(len(fix.local), fix.inside, fix.chance) < -ODDS:
-            self._fix, self._searched_stems = None, 0
             self._first = len(self._stamp_ns) - 1  # what was seen before is in another place of the local map
-            l10n = self.localisation
-            self.localisation = Localisation(
-                driven=l10n.driven,
-                searches=l10n.searches,
-                withdrawn=l10n.withdrawn + 1,
-                reason="contradicted",
-            )
+            self._search_again("contradicted", withdrawn=self.localisation.withdrawn + 1)
             return
         if fix.pose is not None and len(fix.local) >= FEWEST:
             self._use(fix, fix.pose, terrain, is_new=False)
@@ -238,7 +231,6 @@ class Localiser:
         self._fix, self._fixed_at = fix, self._driven[-1]
         self._next = self._driven[-1] + TRACK_EVERY
         at = pose.apply(place[None])[0]
-        shared = (SHARED * self._slack) ** 2
         height = (
             None
             if terrain is None
@@ -248,7 +240,7 @@ class Localiser:
             self.localisation,
             state=State.FOUND,
             T_map_odom=pose,
-            covariance=fix.covariance_at(place) + np.diag([shared, shared, 0.0]),
+            covariance=fix.covariance_at(place) + self._shared,
             stems=len(fix.local),
             of=max(fix.inside, len(fix.local)),
             residual=fix.residual,
@@ -258,14 +250,33 @@ class Localiser:
         )
 
     def _drift(self) -> None:
-        """Enlarge the covariance of the last fix by the drift since then."""
+        """Enlarge the covariance of the last fix by the drift since then; search again if the place is too
+        uncertain for a fix."""
         if self._fix is None:
             return
         way = self._driven[-1] - self._fixed_at
         added = np.diag([DRIFT_XY**2 * way, DRIFT_XY**2 * way, DRIFT_YAW**2 * way])
         place = np.array([self._pose.x, self._pose.y])
         grown = replace(self._fix, covariance=self._fix.covariance + added)
-        self.localisation = replace(self.localisation, covariance=grown.covariance_at(place), stems=0, of=0)
+        covariance = grown.covariance_at(place) + self._shared
+        if max(np.sqrt(np.diag(covariance)[:2])) > SIGMA_XY:
+            self._search_again("outside of the map", withdrawn=self.localisation.withdrawn)
+            return
+        self.localisation = replace(self.localisation, covariance=covariance, stems=0, of=0)
+
+    @property
+    def _shared(self) -> Float:
+        """Covariance of the distortion that the stems around the robot share, shape (3, 3)."""
+        variance = (SHARED * self._slack) ** 2
+        return np.diag([variance, variance, 0.0])
+
+    def _search_again(self, reason: str, *, withdrawn: int) -> None:
+        """Give up the fix."""
+        self._fix, self._searched_stems = None, 0
+        before = self.localisation
+        self.localisation = Localisation(
+            driven=before.driven, searches=before.searches, withdrawn=withdrawn, reason=reason
+        )
 
     def _in_view(self, trees: Trees) -> MapStems:
         """Return the stems that tell where the robot is now, in the local frame."""
@@ -306,14 +317,17 @@ def _log_odds(k: int, n: int, p: float) -> float:
     return k * math.log(q / p) + (n - k) * math.log((1.0 - q) / (1.0 - p))
 
 
-def _would_be_found(fix: Fix, n: int, level: float) -> bool:
+def _would_be_found(fix: Fix, n: int, of: int, level: float) -> bool:
     """Return whether a search of n stems that found nothing would have found the place with a probability of
-    1 - MISSED, if the share AGREEING of the stems were in the map."""
+    1 - MISSED, if the share AGREEING of the stems, or of the `of` stems of the map if these are fewer, were
+    seen in the map."""
+    if fix.reason == "too few stems":
+        return False
     chance = max(fix.wrong_chance(n), 1e-3)
     needed = next(
         (k for k in range(n + 1) if false_alarms(k, n, fix.looked, chance) <= math.log(level)), n + 1
     )
-    return needed <= n and float(binom.cdf(needed - 1, n, AGREEING)) <= MISSED
+    return float(binom.cdf(needed - 1, min(n, of), AGREEING)) <= MISSED
 
 
 __all__ = ["Localisation", "Localiser", "State"]

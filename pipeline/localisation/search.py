@@ -341,7 +341,7 @@ def search_map(local: MapStems, index: MapIndex, slack: float, level: float) -> 
     refined = [refine(rough[k], centred, index, slack) for k in best_first]
     refined.sort(key=lambda each: -int(np.count_nonzero(each[1] >= 0)))
     if not refined or np.count_nonzero(refined[0][1] >= 0) < LEAST:
-        return _none("no agreement", looked=looked)
+        return _none("no agreement", looked=looked, chance=index.chance)
     rivals = (o for pose, o in refined[1:] if not _is_same(pose, refined[0][0]))
     second = int(np.count_nonzero(next(rivals, np.zeros(0)) >= 0))
     fix = _fix(*refined[0], centred, mean, index, slack, second=second, looked=looked)

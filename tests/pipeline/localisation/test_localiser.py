@@ -111,15 +111,34 @@ def test_stems_of_another_place_withdraw_a_fix():
     assert "contradicted" in got.text or got.state is State.ABSENT
 
 
-def test_outside_of_the_map_the_covariance_grows():
+def test_outside_of_the_map_the_covariance_grows_until_the_robot_is_searched_again():
     place = stand(1, side=60.0)
     localiser = Localiser(stored(place))
-    poses = [Pose2(20.0 + 2.0 * k, 30.0, 0.0) for k in range(60)]
-    sigma = [np.sqrt(got.covariance[0, 0]) for _, got in drive(localiser, place, poses, 1)]
-    got = localiser.localisation
-    assert got.state is State.FOUND
-    assert got.of == 0
-    assert sigma[-1] > 3.0 * sigma[10] > 0.0
+    x = [20.0 + 2.0 * k for k in range(50)]
+    poses = [Pose2(at, 30.0, 0.0) for at in (*x, *x[-2::-1])]  # there and back
+    got = list(drive(localiser, place, poses, 1))
+    states = [now.state for _, now in got]
+    left = next(k for k, (_, now) in enumerate(got) if now.state is State.FOUND and now.of == 0)
+    sigma = [np.sqrt(now.covariance[0, 0]) for _, now in got]
+    lost = left + states[left:].index(State.SEARCHING)
+    assert lost > left
+    assert sigma[left - 1] > 0.0
+    assert (np.diff(sigma[left - 1 : lost]) > 0.0).all()
+    assert got[lost][1].T_map_odom is None
+    assert got[lost][1].reason == "outside of the map"
+    assert State.FOUND not in states[lost:50]
+    true, last_one = got[-1]
+    assert last_one.state is State.FOUND
+    assert last_one.withdrawn == 0
+    assert errors(true, last_one.T_map_odom)[0] < 0.4
+
+
+def test_a_map_of_few_stems_is_never_said_to_be_elsewhere():
+    for few in (1, 3, 6, 12):
+        here = stand(3, density=0.08)
+        place = np.random.default_rng(few).uniform(0.0, 20.0, (few, 2)) + 500.0
+        _, got = last(Localiser(stored(place)), here, way(3, SIDE), 3)
+        assert got.state is State.SEARCHING, few
 
 
 def test_the_same_input_gives_the_same_fix():
