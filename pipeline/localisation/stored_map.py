@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
-from pipeline.io.checkpoints.codec import record_bytes, record_of
+from pipeline.io.checkpoints.codec import decode, record_bytes, record_parts
 from pipeline.loop_closure.stem_matching import MapStems, worst_sigma
 from pipeline.types.records import Int, Int32, Trees, UInt16
 
@@ -70,7 +70,16 @@ class StoredMap:
 
     def as_bytes(self) -> bytes:
         """Return the map as the bytes of a file, see `of_bytes`. Positions are rounded to MILLIMETRE, sigmas
-        and diameters to 0.1 mm (at most 6.5 m), and the terrain to cells of TERRAIN_CELL and 1 cm."""
+        and diameters to 0.1 mm (at most 6.5 m), and the terrain to cells of TERRAIN_CELL and 1 cm.
+
+        Raises:
+            StemmapError: A stem is more than 2,147 km from the origin.
+        """
+        if len(self) and np.abs(self.position).max() / MILLIMETRE > np.iinfo(np.int32).max:
+            raise StemmapError(
+                "a tree is more than 2,147 km from the origin of the map",
+                remedy="Map the run again without the offset of its coordinates",
+            )
         sigma = np.sqrt(np.maximum(self.covariance[:, [0, 2]], 0.0))
         product = np.maximum(sigma[:, 0] * sigma[:, 1], 1e-12)
         cell, height = _coarse(self.terrain)
@@ -100,19 +109,20 @@ class StoredMap:
             content = unpacker.decompress(data, LARGEST_FILE)
             if not unpacker.eof:
                 raise damaged
-            p = record_of(_Packed, content)
+            tree, arrays = record_parts(content)
+            if isinstance(tree, dict) and tree.get("format") != FORMAT:
+                raise StemmapError(
+                    f"it has format {tree.get('format')!r}, and this version reads {FORMAT}",
+                    where=where,
+                    remedy="Write it again",
+                )
+            p = decode(_Packed, tree, arrays, planes=True)
         except (ValueError, KeyError, TypeError, RuntimeError, zlib.error):
             raise damaged from None
         n, k = len(p.number), len(p.cell)
         shapes = (p.position.shape, p.sigma.shape, p.correlation.shape, p.dbh.shape, p.dbh_sigma.shape)
         if shapes != ((n, 2), (n, 2), (n,), (n,), (n,)) or p.cell.shape != (k, 2) or p.height.shape != (k,):
             raise damaged
-        if p.format != FORMAT:
-            raise StemmapError(
-                f"it has format {p.format}, and this version reads {FORMAT}",
-                where=where,
-                remedy="Write it again",
-            )
         sigma = _metres(p.sigma)
         xy = p.correlation / 127.0 * sigma[:, 0] * sigma[:, 1]
         middle = (p.cell + 0.5) * TERRAIN_CELL

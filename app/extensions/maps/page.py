@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,9 @@ if TYPE_CHECKING:
     from app.dashboard.dashboard import Dashboard
     from app.extensions.maps.localise import LocalisedRun
     from pipeline.localisation import StoredMap
+    from pipeline.types.records import Frame
 
+_log = logging.getLogger(__name__)
 PAUSE_S = 0.3  # between two looks at the newest scan; a search takes less
 
 
@@ -32,16 +35,20 @@ class Locating:
     def __init__(self, dashboard: Dashboard, tell: Callable[[dict[str, Any]], None]) -> None:
         self._dashboard, self._tell = dashboard, tell
         self._task: asyncio.Task[None] | None = None
+        self._lock = asyncio.Lock()  # of begin and forget: no task is left that nobody can stop
         self._run: LocalisedRun | None = None
+        self._problem = ""
         self.name = ""
         self.stored: StoredMap | None = None
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state as a dict of JSON values: `name`; `state`, "idle", "searching", "found" or
-        "absent"; `text`; and `pose`, the frame of the stored map in that of the open run, [x, y, yaw] [m, m,
-        rad], None unless found."""
+        """Return the state as a dict of JSON values: `name`; `state`, "idle", "searching", "found",
+        "absent" or "failed"; `text`; and `pose`, the frame of the stored map in that of the open run, [x, y,
+        yaw] [m, m, rad], None unless found."""
         if self.stored is None:
             return {"name": "", "state": "idle", "text": "", "pose": None}
+        if self._problem:
+            return {"name": self.name, "state": "failed", "text": self._problem, "pose": None}
         if self._run is None:
             return {"name": self.name, "state": "searching", "text": "not found yet", "pose": None}
         now = self._run.localisation
@@ -62,42 +69,60 @@ class Locating:
         from app.extensions.maps.stored_map import read_stored_map
         from pipeline.errors import StemmapError
 
-        stored = await asyncio.to_thread(read_stored_map, folder)
-        if not len(stored):
-            raise StemmapError("the map has no trees", where=name)
-        await self.forget()
-        self.name, self.stored = name, stored
-        self._task = asyncio.create_task(self._follow(stored))
-        self._tell(self.as_plain())
+        async with self._lock:
+            stored = await asyncio.to_thread(read_stored_map, folder)
+            if not len(stored):
+                raise StemmapError("the map has no trees", where=name)
+            await self._end()
+            self.name, self.stored = name, stored
+            self._task = asyncio.create_task(self._follow(stored))
+            self._tell(self.as_plain())
 
     async def forget(self) -> None:
         """End it; nothing happens if there is none."""
-        task, self._task = self._task, None
-        await cancel(task)
-        self.name, self.stored, self._run = "", None, None
-        self._tell(self.as_plain())
+        async with self._lock:
+            await self._end()
+            self._tell(self.as_plain())
 
     async def close(self) -> None:
         """End it with the server."""
-        await cancel(self._task)
+        async with self._lock:
+            await self._end()
+
+    async def _end(self) -> None:
+        """End the task and forget the map."""
+        task, self._task = self._task, None
+        await cancel(task)
+        self.name, self.stored, self._run, self._problem = "", None, None, ""
 
     async def _follow(self, stored: StoredMap) -> None:
-        """Locate each newest scan. After a jump back in time, and in another run, the search begins again."""
-        from app.extensions.maps.localise import LocalisedRun
-
-        last: tuple[int | None, int] | None = None
+        """Locate each newest scan. After a jump back in time, and in another run, the search begins again;
+        after a fault in another run only."""
+        run, last = self._dashboard.run, -1
         told = self.as_plain()
         while True:
+            if self._dashboard.run != run:
+                run, self._run, self._problem = self._dashboard.run, None, ""
             shown = self._dashboard.shown
-            if shown is not None and shown.frame.of_drive:
-                at = (self._dashboard.run, shown.frame.stamp_ns)
-                if last is None or at[0] != last[0] or at[1] < last[1]:
-                    slack = self._dashboard.parameters.parameters.relocalisation.slack
-                    self._run, last = await asyncio.to_thread(LocalisedRun, stored, slack), None
-                if at != last and self._run is not None:
-                    last = at
-                    await asyncio.to_thread(self._run.add, shown.frame)
-                    if (now := self.as_plain()) != told:
-                        told = now
-                        self._tell(now)
+            if shown is not None and shown.run == run and shown.frame.of_drive and not self._problem:
+                try:
+                    last = await self._locate(stored, shown.frame, last)
+                except Exception as error:
+                    _log.exception("the localisation in the map of %s failed", self.name)
+                    self._run, self._problem = None, f"the localisation failed: {error}"
+            if self._dashboard.run == run and (now := self.as_plain()) != told:
+                told = now
+                self._tell(now)
             await asyncio.sleep(PAUSE_S)
+
+    async def _locate(self, stored: StoredMap, frame: Frame, last: int) -> int:
+        """Locate a scan if it is not that of the time `last` [ns]; return its time [ns]."""
+        from app.extensions.maps.localise import LocalisedRun
+
+        if self._run is None or frame.stamp_ns < last:
+            slack = self._dashboard.parameters.parameters.relocalisation.slack
+            self._run = await asyncio.to_thread(LocalisedRun, stored, slack)
+        elif frame.stamp_ns == last:
+            return last
+        await asyncio.to_thread(self._run.add, frame)
+        return frame.stamp_ns

@@ -104,10 +104,20 @@ def record_of(kind: type[R], data: bytes) -> R:
     Raises:
         ValueError: The bytes are damaged. Damaged bytes can also raise KeyError, TypeError or RuntimeError.
     """
+    return decode(kind, *record_parts(data), planes=True)
+
+
+def record_parts(data: bytes) -> tuple[Any, bytes]:
+    """Return the JSON values and the bytes of the arrays from the result of `record_bytes`, for `decode` with
+    planes.
+
+    Raises:
+        ValueError: The bytes are damaged.
+    """
     end = _LENGTH + int.from_bytes(data[:_LENGTH], "little")
     if len(data) < end:
         raise ValueError("the block is cut off")
-    return decode(kind, msgspec.json.decode(data[_LENGTH:end]), data[end:], planes=True)
+    return msgspec.json.decode(data[_LENGTH:end]), data[end:]
 
 
 def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401

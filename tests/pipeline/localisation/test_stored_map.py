@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import zlib
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
 from pipeline.errors import StemmapError
+from pipeline.io.checkpoints.codec import record_bytes
 from pipeline.localisation import StoredMap
 from tests.pipeline.localisation.stands import stand, trees_at
+
+
+@dataclass
+class Later:
+    """A file of a later version."""
+
+    format: int
+    name: str
 
 
 def example():
@@ -40,6 +50,17 @@ def test_a_file_gives_the_map_to_its_precision():
 def test_a_stem_needs_about_ten_bytes():
     place = stand(2, side=150.0)
     assert len(StoredMap.of(trees_at(place)).as_bytes()) < 20 * len(place)
+
+
+def test_a_northing_is_not_written_as_another_place():
+    with pytest.raises(StemmapError, match="km from the origin"):
+        StoredMap.of(trees_at(np.array([[500_000.0, 5_300_000.0]]))).as_bytes()
+
+
+def test_a_later_format_is_named():
+    content = record_bytes(Later(format=2, name="stand"))
+    with pytest.raises(StemmapError, match="has format 2, and this version reads 1"):
+        StoredMap.of_bytes(zlib.compress(content), "file")
 
 
 @pytest.mark.parametrize(

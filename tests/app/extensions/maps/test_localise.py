@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,7 +110,7 @@ def test_a_doubtful_map_is_not_added_and_said(stand, tmp_path, capsys, monkeypat
 
     map_to = map_command.map_to
 
-    def doubtful(*arguments):
+    def doubtful(*arguments: Any) -> Any:
         outcome, replaces = map_to(*arguments)
         outcome.warnings.append(f"{WRONG[0]} since 3 s")
         return outcome, replaces

@@ -27,7 +27,7 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.02)
 
 
-def shown(stamp_ns: int, place: np.ndarray, T_odom_base: Pose2) -> Any:
+def shown(stamp_ns: int, place: np.ndarray, T_odom_base: Pose2, run: int = 1) -> Any:
     """A shown scan with a map of trees."""
     frame = SimpleNamespace(
         stamp_ns=stamp_ns,
@@ -38,7 +38,7 @@ def shown(stamp_ns: int, place: np.ndarray, T_odom_base: Pose2) -> Any:
         base_z=0.0,
         of_drive=True,
     )
-    return SimpleNamespace(frame=frame)
+    return SimpleNamespace(run=run, frame=frame)
 
 
 def dashboard() -> Any:
@@ -69,11 +69,39 @@ async def test_it_is_found_told_and_forgotten(folder, monkeypatch):
     await until(lambda: told[-1]["state"] == "found")
     assert told[-1]["text"].startswith("found: ")
     assert told[-1]["pose"] == pytest.approx(true.inverse().as_array().tolist(), abs=0.05)
-    here.run, here.shown = 2, shown(1_000_000_000, np.zeros((0, 2)), Pose2())  # another run is opened
+    here.run = 2  # another run is opened, and nothing of it is shown yet
     await until(lambda: told[-1]["state"] == "searching")
+    here.shown = shown(1_000_000_000, true.inverse().apply(near), Pose2(), run=2)
+    await until(lambda: told[-1]["state"] == "found")
     await locating.forget()
     assert told[-1]["state"] == "idle"
     await locating.close()
+
+
+async def test_a_fault_is_told_until_another_run_is_opened(folder, monkeypatch):
+    monkeypatch.setattr(page, "PAUSE_S", 0.01)
+    told: list[dict[str, Any]] = []
+    here = dashboard()
+    locating = Locating(here, told.append)
+    await locating.begin("stand", folder)
+    bad = shown(1_000_000_000, np.zeros((0, 2)), Pose2())
+    bad.frame.trees = None
+    here.shown = bad
+    await until(lambda: told[-1]["state"] == "failed")
+    assert told[-1]["text"].startswith("the localisation failed")
+    assert told[-1]["pose"] is None
+    here.run, here.shown = 2, None
+    await until(lambda: told[-1]["state"] == "searching")
+    await locating.close()
+
+
+async def test_two_at_once_leave_one_that_can_be_ended(folder):
+    locating = Locating(dashboard(), lambda _: None)
+    before = asyncio.all_tasks()
+    await asyncio.gather(*(locating.begin(name, folder) for name in ("a", "b", "c")))
+    assert len(asyncio.all_tasks() - before) == 1
+    await locating.forget()
+    assert asyncio.all_tasks() == before
 
 
 async def test_a_map_without_trees_is_refused(tmp_path):
