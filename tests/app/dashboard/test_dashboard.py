@@ -31,6 +31,7 @@ from app.worker.protocol import (
     Shown,
     Status,
     Unmapped,
+    WorkerBusyError,
 )
 from pipeline.config import preset
 from pipeline.errors import ParameterError, SourceError
@@ -90,6 +91,17 @@ async def test_an_opened_source_is_played(dashboard: Dashboard) -> None:
     assert ("truth", True) in scene_calls(dashboard)
     kinds = [tree["kind"] for tree in browser_knows(dashboard)["truth"]["trees"]]
     assert kinds == ["tree", "tree", "pole"]
+
+
+async def test_a_run_begins_though_its_repairs_could_not_be_sent(
+    dashboard: Dashboard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def busy() -> None:
+        raise WorkerBusyError("the mapping process is busy")
+
+    monkeypatch.setattr(dashboard, "_send_repairs", busy)
+    await dashboard.receive(opened())
+    assert begun(dashboard).run == 1
 
 
 async def test_the_preset_that_suits_is_set_before_the_first_scan(dashboard: Dashboard) -> None:
