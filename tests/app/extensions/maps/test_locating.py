@@ -98,6 +98,7 @@ async def test_a_fault_is_told_until_another_run_is_opened(folder, monkeypatch):
 async def test_two_at_once_leave_one_that_can_be_ended(folder):
     locating = Locating(dashboard(), lambda _: None)
     before = asyncio.all_tasks()
+    await locating.begin("first", folder)
     await asyncio.gather(*(locating.begin(name, folder) for name in ("a", "b", "c")))
     assert len(asyncio.all_tasks() - before) == 1
     await locating.forget()
