@@ -36,6 +36,8 @@ TABLE = "runs.csv"
 _COLUMNS = ("run", "exit_code", "trees", "scans", "distance_m", "message")
 #: Files of an earlier map, which may have another frame, as `RunFiles.finish` removes them.
 _OF_EARLIER = ("seen.csv", "georeference.json", ODOMETRY, "state.zip")
+#: First words of messages about a run; others tell of this start, such as those on the compilation.
+_ABOUT_RUN = ("warning: ", "left out: ", "stemmap: ")
 _CANNOT_RUN = 1  # exit code of a run whose process was lost
 
 
@@ -44,7 +46,7 @@ class MappedFiles(msgspec.Struct, frozen=True):
 
     Attributes:
         code: Exit code of `stemmap map`.
-        messages: What it printed to standard error, in lines.
+        messages: Lines that it printed to standard error about the run.
         files: Dict from the names of its files, relative to the folder of the run, to their bytes.
     """
 
@@ -94,7 +96,7 @@ def map_files(task: bytes) -> bytes:
         return msgspec.msgpack.encode(
             MappedFiles(
                 outcome.code,
-                outcome.messages.splitlines(),
+                [line for line in outcome.messages.splitlines() if line.startswith(_ABOUT_RUN)],
                 {path.relative_to(folder).as_posix(): path.read_bytes() for path in found},
             )
         )
