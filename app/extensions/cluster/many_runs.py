@@ -36,7 +36,8 @@ TABLE = "runs.csv"
 _COLUMNS = ("run", "exit_code", "trees", "scans", "distance_m", "message")
 #: Files of an earlier map, which may have another frame, as `RunFiles.finish` removes them.
 _OF_EARLIER = ("seen.csv", "georeference.json", ODOMETRY, "state.zip")
-#: First words of messages about a run; others tell of this start, such as those on the compilation.
+#: First words of the messages about a run. Other lines, such as the progress of a compilation, depend on the
+#: machine and are left out.
 _ABOUT_RUN = ("warning: ", "left out: ", "stemmap: ")
 _CANNOT_RUN = 1  # exit code of a run whose process was lost
 
@@ -154,7 +155,7 @@ def map_runs(
     Raises:
         OSError, StemmapError: A file cannot be written.
     """
-    results: dict[str, MappedFiles] = {}
+    rows: dict[str, tuple[object, ...]] = {}  # without the files, which would fill the memory
 
     def mapped(place: int, words: Sequence[str]) -> MappedFiles:
         try:
@@ -163,7 +164,7 @@ def map_runs(
             return MappedFiles(_CANNOT_RUN, [f"stemmap: {error}"], {})
         return msgspec.msgpack.decode(answer, type=MappedFiles)
 
-    places = pool.count
+    codes, places = dict[str, int](), pool.count
     out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(places, "runs") as threads:
         futures = {
@@ -171,16 +172,16 @@ def map_runs(
         }
         try:
             for future in as_completed(futures):
-                name = futures[future]
+                name = futures.pop(future)
                 result = _written(out / name, future.result(), force=force)
-                results[name] = result
-                write_texts(out, {TABLE: _table((each, results[each]) for each in tasks if each in results)})
+                codes[name], rows[name] = result.code, _row(name, result)
+                write_texts(out, {TABLE: _table(rows[each] for each in tasks if each in rows)})
                 done(name, result)
         except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
             pool.close(end_processes)
             raise
-    return [results[name].code for name in tasks]
+    return [codes[name] for name in tasks]
 
 
 def _written(folder: Path, result: MappedFiles, *, force: bool) -> MappedFiles:
@@ -206,15 +207,17 @@ def _written(folder: Path, result: MappedFiles, *, force: bool) -> MappedFiles:
     return result
 
 
-def _table(results: Iterable[tuple[str, MappedFiles]]) -> str:
-    """Return the table of the runs as CSV; figures of a run without files are empty."""
+def _row(name: str, result: MappedFiles) -> tuple[object, ...]:
+    """Return the row of a run in the table; figures of a run without files are empty."""
+    record = json.loads(result.files.get("run.json", b"{}"))
+    figures = [record.get(key, "") for key in ("trees", "scans", "distance_m")]
+    return (name, result.code, *figures, result.messages[0] if result.messages else "")
+
+
+def _table(rows: Iterable[tuple[object, ...]]) -> str:
+    """Return the table of the runs as CSV."""
     text = io.StringIO()
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow(_COLUMNS)
-    for name, result in results:
-        record = json.loads(result.files.get("run.json", b"{}"))
-        figures = [record.get(key, "") for key in ("trees", "scans", "distance_m")]
-        rows.writerow([name, result.code, *figures, result.messages[0] if result.messages else ""])
+    csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *rows])
     return text.getvalue()
 
 

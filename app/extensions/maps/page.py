@@ -35,7 +35,7 @@ class Locating:
     def __init__(self, dashboard: Dashboard, tell: Callable[[dict[str, Any]], None]) -> None:
         self._dashboard, self._tell = dashboard, tell
         self._task: asyncio.Task[None] | None = None
-        self._lock = asyncio.Lock()  # of begin and forget: no task is left that nobody can stop
+        self._lock = asyncio.Lock()  # held by `begin`, `forget` and `close`, so that one task runs at a time
         self._run: LocalisedRun | None = None
         self._problem = ""
         self.name = ""
@@ -99,7 +99,7 @@ class Locating:
         """Locate each newest scan. After a jump back in time, and in another run, the search begins again;
         after a fault in another run only."""
         run, last = self._dashboard.run, -1
-        told = self.as_plain()
+        before = self.as_plain()
         while True:
             if self._dashboard.run != run:
                 run, self._run, self._problem = self._dashboard.run, None, ""
@@ -110,8 +110,8 @@ class Locating:
                 except Exception as error:
                     _log.exception("the localisation in the map of %s failed", self.name)
                     self._run, self._problem = None, f"the localisation failed: {error}"
-            if self._dashboard.run == run and (now := self.as_plain()) != told:
-                told = now
+            if self._dashboard.run == run and (now := self.as_plain()) != before:
+                before = now
                 self._tell(now)
             await asyncio.sleep(PAUSE_S)
 
