@@ -35,7 +35,7 @@ _EXTRA = re.compile(r"([\w.-]+).*extra == ['\"](\w+)['\"]")  # a package of an e
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class MachineCheck:
     """Result of one test.
 
     Attributes:
@@ -79,7 +79,7 @@ def run(_arguments: argparse.Namespace) -> int:
     return int(any(check.remedy and check.is_needed for check in checks))
 
 
-def all_checks(settings: Settings) -> list[Check]:
+def all_checks(settings: Settings) -> list[MachineCheck]:
     """Return the results of all tests.
 
     Args:
@@ -96,16 +96,16 @@ def all_checks(settings: Settings) -> list[Check]:
     ]
 
 
-def memory_check(free: int | None) -> Check:
+def memory_check(free: int | None) -> MachineCheck:
     """Return whether enough memory is free.
 
     Args:
         free: Free memory [bytes]; None if it is unknown.
     """
     if free is None:
-        return Check("memory", "the free memory is unknown on this system")
+        return MachineCheck("memory", "the free memory is unknown on this system")
     need = f"free {MEMORY / GB:.0f} GB: end other programs, or use a machine with more memory"
-    return Check("memory", f"{free / GB:.1f} GB are free", "" if free >= MEMORY else need)
+    return MachineCheck("memory", f"{free / GB:.1f} GB are free", "" if free >= MEMORY else need)
 
 
 def available_memory() -> int | None:
@@ -129,14 +129,14 @@ def available_memory() -> int | None:
     return min(free, max(limit - used, 0))
 
 
-def cores_check(cores: int) -> Check:
+def cores_check(cores: int) -> MachineCheck:
     """Return whether there are enough cores.
 
     Args:
         cores: Number of usable cores.
     """
     need = f"use a machine with {CORES} cores; with one, the page is slow while a run is mapped"
-    return Check(
+    return MachineCheck(
         "processor", f"{cores} usable core{'s' if cores != 1 else ''}", "" if cores >= CORES else need
     )
 
@@ -152,7 +152,7 @@ def compile_target() -> str | None:
     return numba.config.CPU_NAME or None
 
 
-def instructions_check(target: str | None) -> Check:
+def instructions_check(target: str | None) -> MachineCheck:
     """Return whether compiled kernels of a wheel fit the processor.
 
     Args:
@@ -160,37 +160,37 @@ def instructions_check(target: str | None) -> Check:
     """
     machine = platform.machine()
     if target is not None:
-        return Check("instructions", f"{machine}, compiled for {target}")
+        return MachineCheck("instructions", f"{machine}, compiled for {target}")
     need = "the first start takes minutes, because kernels are compiled here"
-    return Check("instructions", f"{machine} without the level x86-64-v3", need, is_needed=False)
+    return MachineCheck("instructions", f"{machine} without the level x86-64-v3", need, is_needed=False)
 
 
-def folder_checks(folder: Path | None) -> list[Check]:
+def folder_checks(folder: Path | None) -> list[MachineCheck]:
     """Return whether the data folder can be written and has room.
 
     Args:
         folder: The data folder, which need not exist; None for none.
     """
     if folder is None:
-        return [Check("data folder", "none: runs are lost at the end", "name one with STEMMAP_FOLDER")]
+        return [MachineCheck("data folder", "none: runs are lost at the end", "name one with STEMMAP_FOLDER")]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"stemmap")
     except OSError as error:
         need = "make it writable, or name another with STEMMAP_FOLDER"
-        return [Check("data folder", f"{folder}: {error.strerror}", need)]
+        return [MachineCheck("data folder", f"{folder}: {error.strerror}", need)]
     free = shutil.disk_usage(folder).free
     need = (
         f"{DISK / GB:.0f} GB are needed for an hour of scans: delete old runs, or name another STEMMAP_FOLDER"
     )
     return [
-        Check("data folder", f"{folder} can be written"),
-        Check("disk", f"{free / GB:.1f} GB are free there", "" if free >= DISK else need),
+        MachineCheck("data folder", f"{folder} can be written"),
+        MachineCheck("disk", f"{free / GB:.1f} GB are free there", "" if free >= DISK else need),
     ]
 
 
-def clock_check(now_s: float) -> Check:
+def clock_check(now_s: float) -> MachineCheck:
     """Return whether the clock can be right.
 
     Args:
@@ -198,11 +198,13 @@ def clock_check(now_s: float) -> Check:
     """
     found = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
     if now_s < EARLIEST_S:
-        return Check("clock", found, "set the clock: names of recordings and expiry of links depend on it")
-    return Check("clock", found + (", synchronised" if _SYNCHRONISED.exists() else ""))
+        return MachineCheck(
+            "clock", found, "set the clock: names of recordings and expiry of links depend on it"
+        )
+    return MachineCheck("clock", found + (", synchronised" if _SYNCHRONISED.exists() else ""))
 
 
-def port_check(host: str, port: int | None) -> Check:
+def port_check(host: str, port: int | None) -> MachineCheck:
     """Return whether the server can listen.
 
     Args:
@@ -220,11 +222,11 @@ def port_check(host: str, port: int | None) -> Check:
         need = "end the program that listens there, or choose another: stemmap serve --port N"
         if port is None:
             need = "nothing: one of the next ports is used; --port N chooses one"
-        return Check("port", f"{host}:{number}: {error.strerror}", need, is_needed=port is not None)
-    return Check("port", f"{host}:{number} is free")
+        return MachineCheck("port", f"{host}:{number}: {error.strerror}", need, is_needed=port is not None)
+    return MachineCheck("port", f"{host}:{number} is free")
 
 
-def extra_checks(missing: Callable[[str], bool] | None = None) -> list[Check]:
+def extra_checks(missing: Callable[[str], bool] | None = None) -> list[MachineCheck]:
     """Return whether the packages of each optional extra are installed.
 
     Args:
@@ -236,7 +238,7 @@ def extra_checks(missing: Callable[[str], bool] | None = None) -> list[Check]:
         if found := _EXTRA.match(text):
             packages.setdefault(found.group(2), []).append(found.group(1))
     return [
-        Check(
+        MachineCheck(
             f"extra {name}",
             ", ".join(needed),
             offer.format(name) if any(map(missing or _is_missing, needed)) else "",

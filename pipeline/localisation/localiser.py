@@ -21,7 +21,7 @@ from scipy.stats import binom
 
 from pipeline.geometry.poses import Float, Pose2, Pose3
 from pipeline.localisation.heights import HeightFix, align_heights
-from pipeline.localisation.search import SIGMA_XY, Fix, MapIndex, false_alarms, fix_near, search_map
+from pipeline.localisation.search import SIGMA_XY, MapFix, MapIndex, false_alarms, fix_near, search_map
 from pipeline.localisation.stored_map import StoredMap
 from pipeline.loop_closure.stem_matching import MapStems, Match, worst_sigma
 from pipeline.slam.places import AGREEING, ODDS
@@ -126,7 +126,7 @@ class Localiser:
         self._driven: list[float] = []
         self._pose = Pose2()
         self._view: Detections | None = None
-        self._fix: Fix | None = None
+        self._fix: MapFix | None = None
         self._fixed_at = self._next = 0.0
         self._searched_stems = self._first = 0
 
@@ -225,7 +225,7 @@ class Localiser:
         else:
             self._drift()
 
-    def _use(self, fix: Fix, pose: Pose2, terrain: Float | None, *, is_new: bool) -> None:
+    def _use(self, fix: MapFix, pose: Pose2, terrain: Float | None, *, is_new: bool) -> None:
         """Take over a fix with its pose: new, or an alignment of the present one."""
         place = np.array([self._pose.x, self._pose.y])
         self._fix, self._fixed_at = fix, self._driven[-1]
@@ -317,7 +317,7 @@ def _log_odds(k: int, n: int, p: float) -> float:
     return k * math.log(q / p) + (n - k) * math.log((1.0 - q) / (1.0 - p))
 
 
-def _would_be_found(fix: Fix, n: int, of: int, level: float) -> bool:
+def _would_be_found(fix: MapFix, n: int, of: int, level: float) -> bool:
     """Return whether a search of n stems that found nothing would have found the place with a probability of
     1 - MISSED, if the share AGREEING of the stems, or of the `of` stems of the map if these are fewer, were
     seen in the map."""

@@ -248,7 +248,7 @@ Refusal = Literal["too few stems", "no agreement", "could be chance", "ambiguous
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fix:
+class MapFix:
     """Result of a search, or of an alignment from a known pose.
 
     Attributes:
@@ -307,13 +307,13 @@ def false_alarms(k: int, n: int, looked: int, chance: float) -> float:
     return math.log(max(looked, 1)) + float(binom.logsf(k - 3, max(n - 2, 1), chance))
 
 
-def _none(reason: Refusal, *, looked: int = 0, inside: int = 0, chance: float = 0.0) -> Fix:
+def _none(reason: Refusal, *, looked: int = 0, inside: int = 0, chance: float = 0.0) -> MapFix:
     """Return a result without a pose."""
     rows = np.zeros(0, np.int64)
-    return Fix(None, np.zeros(2), np.zeros((3, 3)), reason, rows, rows, inside, 0, looked, chance)
+    return MapFix(None, np.zeros(2), np.zeros((3, 3)), reason, rows, rows, inside, 0, looked, chance)
 
 
-def search_map(local: MapStems, index: MapIndex, slack: float, level: float) -> Fix:
+def search_map(local: MapStems, index: MapIndex, slack: float, level: float) -> MapFix:
     """Return the pose of local stems in a map, without an initial pose.
 
     Args:
@@ -354,7 +354,7 @@ def _is_same(a: Float, b: Float) -> bool:
     return math.hypot(a[0] - b[0], a[1] - b[1]) <= SAME_XY and turn <= SAME_YAW
 
 
-def _decided(fix: Fix, n: int, level: float) -> Fix:
+def _decided(fix: MapFix, n: int, level: float) -> MapFix:
     """Return a fix with the reason of its refusal, by the tests of this module; `n` is the number of local
     stems."""
     k, sigma = len(fix.local), np.sqrt(np.diag(fix.covariance))
@@ -393,7 +393,7 @@ def refine(pose: Float, local: MapStems, index: MapIndex, slack: float) -> tuple
     return pose, of
 
 
-def fix_near(T_map_local: Pose2, local: MapStems, index: MapIndex, slack: float) -> Fix:
+def fix_near(T_map_local: Pose2, local: MapStems, index: MapIndex, slack: float) -> MapFix:
     """Return the pose that fits best near a known one; its reason is None if it is determined, and its
     agreement is not tested. Arguments as in `search_map`."""
     local = relative(local)
@@ -412,7 +412,7 @@ def fix_near(T_map_local: Pose2, local: MapStems, index: MapIndex, slack: float)
 def _fix(
     pose: Float, of: Int, centred: MapStems, mean: Float, index: MapIndex, slack: float,
     *, second: int = 0, looked: int = 0,
-) -> Fix:  # fmt: skip
+) -> MapFix:  # fmt: skip
     """Return a refined pose of the stems about their mean as a fix, without a decision."""
     at = np.flatnonzero(of >= 0)
     to, reference = of[at], index.stems
@@ -425,7 +425,7 @@ def _fix(
         covariance = np.diag([1e6, 1e6, 1e6])
     density, inside = crowding(pose, centred.position, reference.position, WINDOW)
     residual = reference.position[to] - about_mean.apply(centred.position[at])
-    return Fix(
+    return MapFix(
         T_map_local, mean, covariance, None, at, to, inside, second, looked,
         _chance(density, centred, index, slack), float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
     )  # fmt: skip
@@ -443,4 +443,4 @@ def _columns(stems: MapStems) -> tuple[Float, Float, Float, Float]:
     return stems.position, stems.sigma, stems.dbh, stems.dbh_sigma
 
 
-__all__ = ["Fix", "MapIndex", "Refusal", "fix_near", "search_map"]
+__all__ = ["MapFix", "MapIndex", "Refusal", "fix_near", "search_map"]

@@ -184,7 +184,7 @@ def changes(stored: StoredMap, map_folder: FilePath, run: FilePath, T_map_odom: 
 
     Args:
         stored: The map.
-        map_folder: Its folder; where it is a file, no tree can be told to be new.
+        map_folder: Folder of the map; if it is a packed file, which has no seen area, no tree counts as new.
         run: Folder of the run.
         T_map_odom: Pose of the frame of the run in the map.
 
