@@ -6,6 +6,7 @@ results are bytes that this program decodes as JSON or MessagePack.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
@@ -13,8 +14,11 @@ from typing import Any
 from app.common.text import code_digest, count
 from pipeline.errors import StemmapError
 
-#: How long a scheduler may take to answer, and its first worker to arrive [s]: the default of Dask is 30 s.
-_PATIENCE_S = 15.0
+#: How long a scheduler may take to answer, and its first worker to arrive, also after all were lost [s]: the
+#: default of Dask for a connection.
+_PATIENCE_S = 30.0
+#: How often a task that takes long asks whether the cluster still has workers [s].
+_POLL_S = 5.0
 #: How often a task is repeated after an exception; after the death of a worker the scheduler decides (3).
 _RETRIES = 2
 
@@ -50,24 +54,53 @@ class DaskPool:
         """Return the result of a function for a task, see `app.common.task_pool.TaskPool.call`."""
         client = self._connect()
         try:
-            future = client.submit(
-                function,
-                task,
-                workers=[self._places[place % len(self._places)]],
-                allow_other_workers=True,  # also after the worker has died
-                retries=_RETRIES,
-                pure=False,
-            )
-            self._futures.add(future)
-            result: bytes = future.result()
+            return self._result(client, function, task, self._places[place % len(self._places)])
         except Exception as error:
             raise StemmapError(
                 f"a task was lost: {type(error).__name__}: {error}",
                 where=self._address,
                 remedy="Look at the log of the workers",
             ) from error
-        self._futures.discard(future)
-        return result
+
+    def _result(
+        self,
+        client: Any,  # noqa: ANN401 - distributed has no types
+        function: Callable[[bytes], bytes],
+        task: bytes,
+        preferred: str,
+    ) -> bytes:
+        """Return the result of a function for a task, from the preferred worker while it lives.
+
+        Raises:
+            TimeoutError: All workers are gone. The scheduler itself would wait without end.
+        """
+
+        def submit(**where: Any) -> Any:  # noqa: ANN401
+            future = client.submit(function, task, retries=_RETRIES, pure=False, **where)
+            self._futures.add(future)
+            return future
+
+        future = submit(workers=[preferred], allow_other_workers=True)
+        is_free, seen_s = False, time.monotonic()  # of a preference; when the cluster last had a worker
+        while True:
+            try:
+                result: bytes = future.result(_POLL_S)
+                self._futures.discard(future)
+                return result
+            except TimeoutError:
+                if future.done():  # the exception of the task itself
+                    raise
+            workers = client.nthreads()
+            if workers:
+                seen_s = time.monotonic()
+            elif time.monotonic() - seen_s > _PATIENCE_S:
+                raise TimeoutError("all workers of the cluster are gone")
+            if not is_free and preferred not in workers:
+                # If no other worker was there at that moment, the scheduler never assigns the task again:
+                # it looks for tasks that a new worker may take by their preference alone.
+                client.cancel([future], reason="the worker is gone")
+                self._futures.discard(future)
+                future, is_free = submit(), True
 
     def warnings(self) -> list[str]:
         """Return a warning if workers were lost since the pool connected."""

@@ -17,7 +17,8 @@ _PATIENCE_S = 60.0
 
 @contextmanager
 def dask_cluster(folder: Path, workers: int = 2) -> Iterator[str]:
-    """Yield the address of a scheduler with workers of one thread each; all end with the context.
+    """Yield the address of a scheduler when its workers, of one thread each, have arrived; all end with the
+    context.
 
     Args:
         folder: Folder for their files.
@@ -34,19 +35,32 @@ def dask_cluster(folder: Path, workers: int = 2) -> Iterator[str]:
                 stderr=log,
                 cwd=ROOT,
             )
-            stack.callback(process.wait)
-            stack.callback(process.terminate)
+            stack.callback(_end, process)
+
+        def wait_for(text: str, count: int, file: Path) -> None:
+            until = time.monotonic() + _PATIENCE_S
+            while not file.exists() or file.read_text().count(text) < count:
+                assert time.monotonic() < until, [log.read_text() for log in folder.glob("*.log")]
+                time.sleep(0.1)
 
         start("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(contact))
-        until = time.monotonic() + _PATIENCE_S
-        while not contact.exists() or not contact.read_text():
-            assert time.monotonic() < until, (folder / "dask_scheduler.log").read_text()
-            time.sleep(0.1)
+        wait_for('"address"', 1, contact)
         start(
             "dask_worker", "--scheduler-file", str(contact), "--host", "127.0.0.1", "--nthreads", "1",
             "--nworkers", str(workers), "--local-directory", str(folder / "work"),
         )  # fmt: skip
+        wait_for("Register worker", workers, folder / "dask_scheduler.log")
         yield json.loads(contact.read_text())["address"]
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a program, by force if it does not follow."""
+    process.terminate()
+    try:
+        process.wait(_PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def end_one_process(task: bytes) -> bytes:
@@ -58,6 +72,13 @@ def end_one_process(task: bytes) -> bytes:
         return task
     os.kill(os.getpid(), 9)
     return b""
+
+
+def end_the_worker(task: bytes) -> bytes:
+    """Kill the process of a worker and its parent, which would start another one."""
+    os.kill(os.getppid(), 9)
+    os.kill(os.getpid(), 9)
+    return task
 
 
 def fail(task: bytes) -> bytes:

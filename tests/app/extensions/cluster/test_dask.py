@@ -17,7 +17,7 @@ from app.extensions.search.scoring import Scorer, prepare_run
 from app.sources.request import SourceRequest
 from pipeline.config import preset
 from pipeline.errors import StemmapError
-from tests.app.extensions.cluster.dask_cluster import dask_cluster, end_one_process, fail
+from tests.app.extensions.cluster.dask_cluster import dask_cluster, end_one_process, end_the_worker, fail
 from tests.app.extensions.cluster.test_many_runs import bytes_in, record_runs
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -48,6 +48,22 @@ def test_a_task_whose_worker_died_is_repeated_and_the_loss_is_a_warning(address,
         task = str(tmp_path / "killed").encode()
         assert pool.call(end_one_process, task) == task
         assert pool.warnings() == ["1 worker of the cluster lost; its tasks were repeated"]
+
+
+def test_a_task_is_repeated_after_the_only_worker_died(tmp_path, monkeypatch):
+    monkeypatch.setattr("app.extensions.cluster.dask_pool._POLL_S", 0.2)
+    with dask_cluster(tmp_path, workers=1) as address, connected(address) as pool:
+        task = str(tmp_path / "killed").encode()
+        assert pool.call(end_one_process, task) == task
+
+
+def test_a_cluster_whose_workers_are_gone_is_an_error(tmp_path, monkeypatch):
+    monkeypatch.setattr("app.extensions.cluster.dask_pool._POLL_S", 0.2)
+    with dask_cluster(tmp_path, workers=1) as address, connected(address) as pool:
+        assert pool.count == 1
+        monkeypatch.setattr("app.extensions.cluster.dask_pool._PATIENCE_S", 1.0)
+        with pytest.raises(StemmapError, match="all workers of the cluster are gone"):
+            pool.call(end_the_worker, b"")
 
 
 def test_a_task_that_always_fails_is_an_error(address):
