@@ -109,7 +109,9 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
         StemmapError: There is no data folder.
     """
     if settings.folder is None:
-        raise StemmapError("there is no data folder", remedy="Name a file: --record FILE.mcap")
+        raise StemmapError(
+            "there is no data folder", remedy="Set STEMMAP_FOLDER, or name a file: --record FILE.mcap"
+        )
     return settings.folder / "recordings" / time.strftime("live-%Y%m%d-%H%M%S.mcap", time.gmtime(now_s))
 
 

@@ -523,8 +523,7 @@ def _no_path() -> GrowingColumns:
 
 
 def _open_command(request: SourceRequest) -> protocol.Open:
-    """Return the command that opens a source: the request itself if it is one. Only the command line can
-    request a recording or publishing."""
+    """Return the command that opens a source: the request itself if it is one."""
     if isinstance(request, protocol.Open):
         return request
     return protocol.Open(**{name: getattr(request, name) for name in SourceRequest.__struct_fields__})

@@ -162,7 +162,7 @@ class Open(SourceRequest, frozen=True, tag="open"):
     """Close the current run and open this source. Its parameters arrive with `Begin`.
 
     Attributes:
-        record: Path of the file to which a live run is recorded; empty for none. No browser can set it.
+        record: Path of the file to which a live run is recorded; empty for none.
         publish: Whether the results of a live run are published to the robot's network.
     """
 

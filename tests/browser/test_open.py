@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from tests.app.robot.conftest import free_port
 from tests.browser.conftest import opened
 from tests.browser.serving import Server
 
@@ -100,3 +101,19 @@ def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extension
     assert dialog.locator("#runs tbody tr > *").count() == runs * heads
     dialog.goto(address)
     dialog.locator("#source-button").click()
+
+
+def test_a_sensor_is_opened_by_the_form_and_its_run_is_recorded(page: Page, folder: Path) -> None:
+    page.locator("#source-button").click()
+    page.locator("#source-robot summary").click()
+    page.locator("#robot-fields [name=host]").fill("forest.local")
+    page.locator("#robot-fields [name=robot]").fill("anymal b")
+    expect(page.locator("#source-uri")).to_have_value("zenoh:tcp/forest.local:7447?robot=anymal%20b")
+    page.locator("#robot-kind").select_option("velodyne")
+    expect(page.locator("#source-uri")).to_have_value("")
+    page.locator("#robot-fields [name=from]").fill("127.0.0.1")
+    page.locator("#robot-fields [name=port]").fill(str(free_port()))
+    expect(page.locator("#source-record")).to_be_checked()
+    page.locator("#source-open").click()
+    expect(page.locator("#recording")).to_contain_text("recording live-")
+    assert len(list(folder.glob("live-*.mcap"))) >= 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -14,6 +15,8 @@ from fastapi import APIRouter
 from pydantic import Field, field_validator
 from starlette.responses import Response
 
+from app.common.settings import recordings_place
+from app.sources.live_address import is_live
 from app.sources.opening import ask
 from app.sources.request import (
     LARGEST_SEED,
@@ -27,7 +30,7 @@ from app.sources.request import (
 )
 from app.web.responses import BadRequestError, Body, Value, Word, json_reply
 from app.web.routes.access import Dash, Deployment, Permitted, checked_uri, permitted_request
-from app.worker.protocol import FASTEST, LONGEST_S, MOST_SCANS, Command
+from app.worker.protocol import FASTEST, LONGEST_S, MOST_SCANS, Command, Open
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api")
@@ -92,6 +95,7 @@ class _Source(Body):
 
     Attributes:
         mount: x, y, z [m], roll, pitch, yaw [degrees] of the LiDAR on the robot.
+        record: Whether a live run is recorded to a new file in the data folder.
     """
 
     uri: _Uri
@@ -106,6 +110,7 @@ class _Source(Body):
     )
     preset: Word = ""
     parameters: dict[Word, Value] = Field(default_factory=dict, max_length=500)
+    record: bool = False
 
 
 class _Uninspected(Body):
@@ -140,13 +145,19 @@ async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
 
 
 @router.post("/open")
-async def open_source(body: _Source, dashboard: Dash, permitted: Permitted) -> Response:
+async def open_source(body: _Source, dashboard: Dash, permitted: Permitted, settings: Deployment) -> Response:
     """POST /api/open: close the run and open another source, with its parameters if any are given. The
     response is empty (202); the status reports the result. 403 for a file that the caller may not open, 422
-    for an unknown odometry or invalid parameters, 409 if the source cannot be opened; the open run is kept
-    then."""
-    request = SourceRequest(**{**body.model_dump(), "mount": mount_of_degrees(body.mount)})
-    await dashboard.open(permitted_request(request, permitted))
+    for an unknown odometry, invalid parameters or a recording of what is not live, 409 if the source cannot
+    be opened or there is no data folder for a recording; the open run is kept then."""
+    chosen = {**body.model_dump(exclude={"record"}), "mount": mount_of_degrees(body.mount)}
+    request = permitted_request(SourceRequest(**chosen), permitted)
+    if body.record:
+        if not is_live(request.uri):
+            raise BadRequestError("only a live run can be recorded", where="record", remedy="Leave it out")
+        place = str(recordings_place(settings, time.time()))
+        request = Open(**{name: getattr(request, name) for name in chosen}, record=place)
+    await dashboard.open(request)
     return json_reply({}, 202)
 
 

@@ -7,6 +7,7 @@ import { on, state } from "../core/store.js";
 import { parametersText } from "../playback/timeline.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { completion, isListed, listPlaces, nearMisses, sift } from "./places.js";
+import { recordingOf, showRobot, startRobotForm } from "./robot_form.js";
 import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
@@ -15,12 +16,10 @@ let requested = null; // address that the server checks; the open run is kept me
 let asked = null; // address that is being opened
 let left = null; // status before that
 
-// `begin` is the beginning of an address that a person completes.
-export async function openSources(begin = "") {
+export async function openSources() {
   say("");
   if (!dialog.open) dialog.showModal();
   const address = byId("source-uri");
-  if (typeof begin === "string" && begin) address.value = begin;
   show();
   const { changed: values = [] } = state.parameters ?? {};
   byId("source-parameters").hidden = !values.length;
@@ -31,6 +30,11 @@ export async function openSources(begin = "") {
   } catch (error) {
     say(error.message);
   }
+}
+
+export function connectRobot() {
+  openSources();
+  showRobot();
 }
 
 // A place of the list is opened, or written into the field if something is chosen for it first.
@@ -71,7 +75,7 @@ export async function ask(uri) {
   say("");
   setText(byId("source-open"), "Opening…");
   try {
-    await open({ uri, odometry: byId("source-odometry").value, ...(uri === choice()?.address(path()) ? choice().fields() : {}), ...chosenFor(uri) });
+    await open({ uri, odometry: byId("source-odometry").value, ...(uri === choice()?.address(path()) ? choice().fields() : {}), ...chosenFor(uri), ...recordingOf(uri) });
     if (requested !== uri) return;
     asked = uri;
     follow(state);
@@ -126,6 +130,7 @@ export function startSources() {
   });
   dialog.addEventListener("close", forget);
   startInside();
+  startRobotForm();
   on("status", follow);
   startUpload(async ({ uri }) => { if (!dialog.open) await openSources(); ask(uri); });
 }

@@ -2,20 +2,19 @@
 
 import { byId, recall, remember, setText } from "../core/dom.js";
 import { on } from "../core/store.js";
-import { openSources } from "./dialog.js";
+import { connectRobot, openSources } from "./dialog.js";
 
 const WORDS = {
   playing: ["A robot is mapping a stand of trees", "Keep watching"],
   finished: ["A robot has mapped a stand of trees", "Show its map"],
   starting: ["A robot is about to map a stand of trees", "Keep watching"],
 };
-const ROBOT = "zenoh:tcp/"; // the address of the router follows
 
 export function startWelcome() {
   const card = byId("welcome");
   card.addEventListener("close", () => remember("welcomed", "yes"));
   byId("welcome-open").addEventListener("click", () => card.addEventListener("close", () => openSources(), { once: true }));
-  byId("welcome-robot").addEventListener("click", () => card.addEventListener("close", () => openSources(ROBOT), { once: true }));
+  byId("welcome-robot").addEventListener("click", () => card.addEventListener("close", () => connectRobot(), { once: true }));
   let asked = false;
   on("status", ({ status }) => {
     if (!status.source) return; // no run is opened yet

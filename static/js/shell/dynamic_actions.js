@@ -9,7 +9,7 @@ import { edits } from "../core/permissions.js";
 import { attempted } from "../core/problem.js";
 import { state, trees } from "../core/store.js";
 import { openStory } from "../explain/story.js";
-import { openSources } from "../open/dialog.js";
+import { connectRobot, openSources } from "../open/dialog.js";
 import { chooseView, toggleLayer } from "../scene/layers.js";
 import { openParameter } from "../tune/panel.js";
 import { attempt, isChanged, savedSets, shown, specOf, tuning, use } from "../tune/parameters.js";
@@ -56,6 +56,7 @@ const panels = () => [
   ["Annotate: your name", "", edits(() => { toTab("annotate")(); byId("annotate-name").focus(); })],
   ...(state.annotations?.own == null ? [] : AGAINST.map(([value, words]) => [`Score against ${words}`, "", edits(() => { toTab("scores")(); scoreAgainst(value); })])),
   ["Upload a recording", "", edits(async () => { await openSources(); byId("upload-choose").focus(); })],
+  ["Connect a robot or a sensor", "", edits(connectRobot)],
   ["Topics and mounting of a recording or robot", "", edits(async () => { await openSources(); byId("source-uri").value ||= state.status?.source ?? ""; byId("source-inside").open = true; })],
   ...(byId("warnings-button").hidden ? [] : [["Show the warnings", "", () => byId("warnings-button").click()]]),
 ];

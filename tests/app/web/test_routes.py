@@ -244,6 +244,24 @@ async def test_opening_tells_the_worker(both: Running) -> None:
     assert (await client.get("/api/status")).json()["state"] == "starting"
 
 
+async def test_a_live_run_is_recorded_to_a_new_file_in_the_data_folder(tmp_path: Path) -> None:
+    async with running(Settings(folder=tmp_path)) as (client, dashboard):
+        client.headers.update(BEARER)
+        body = {"uri": "velodyne:127.0.0.1:2368", "record": True}
+        assert (await client.post("/api/open", json=body)).status_code == 202
+        record = Path(told(dashboard)[-1].record)
+        assert record.parent == tmp_path / "recordings"
+        assert record.suffix == ".mcap"
+        answer = await client.post("/api/open", json={**body, "uri": "sim:stand"})
+        assert answer.status_code == 422
+        assert "only a live run can be recorded" in answer.text
+    async with running(Settings()) as (client, dashboard):
+        client.headers.update(BEARER)
+        before = len(told(dashboard))
+        assert (await client.post("/api/open", json=body)).status_code == 409
+        assert len(told(dashboard)) == before
+
+
 @pytest.mark.parametrize(
     "body", [{}, {"uri": ""}, {"uri": 5}, {"uri": "sim:stand", "odometry": "guess"}, {"uri": "a", "seed": -1}]
 )

@@ -1,0 +1,62 @@
+// The form of a live robot or sensor, which writes its address into the field of the dialog.
+
+import { byId, el, recall, remember } from "../core/dom.js";
+
+const LIVE = /^(zenoh|velodyne|dds):/i;
+// For each kind: title, fields [name, title, placeholder], and the address of their values; "" if one is missing.
+const KINDS = {
+  zenoh: {
+    title: "ROS 2 robot through a Zenoh router",
+    fields: [["host", "Address of the router", "192.168.1.5"], ["port", "Port", "7447"], ["robot", "Robot (its namespace)", "the first that sends scans"], ["domain", "ROS domain", "0"]],
+    address: ({ host, port, robot, domain }) => host && `zenoh:tcp/${host}:${port || 7447}${options({ robot, domain })}`,
+  },
+  velodyne: {
+    title: "Velodyne sensor by UDP",
+    fields: [["from", "Address of the sensor", "192.168.1.201"], ["port", "Port on this machine", "2368"]],
+    address: ({ from, port }) => from && `velodyne:0.0.0.0:${port || 2368}?from=${from}`,
+  },
+};
+
+function options(values) {
+  const given = Object.entries(values).filter(([, value]) => value);
+  return given.length ? `?${given.map(([name, value]) => `${name}=${encodeURIComponent(value)}`).join("&")}` : "";
+}
+
+const uri = () => byId("source-uri").value.trim();
+const kind = () => KINDS[byId("robot-kind").value];
+const fields = () => byId("robot-fields");
+
+// Whether the run of an address is recorded: {record: true}, or {} if it is not live.
+export const recordingOf = (address) => (LIVE.test(address) && byId("source-record").checked ? { record: true } : {});
+
+export function showRobot() {
+  byId("source-robot").open = true;
+  fields().querySelector("input").focus();
+}
+
+function build() {
+  fields().replaceChildren(...kind().fields.map(([name, title, placeholder]) =>
+    el("label", {}, title, el("input", { name, type: "text", placeholder, autocomplete: "off", spellcheck: "false", oninput: write }))));
+}
+
+function write() {
+  const values = Object.fromEntries([...fields().querySelectorAll("input")].map(({ name, value }) => [name, value.trim()]));
+  byId("source-uri").value = kind().address(values);
+  byId("source-uri").dispatchEvent(new Event("input"));
+}
+
+export function startRobotForm() {
+  const choice = byId("robot-kind");
+  choice.append(...Object.entries(KINDS).map(([value, { title }]) => el("option", { value, text: title })));
+  choice.addEventListener("change", () => {
+    build();
+    write();
+  });
+  build();
+  const record = byId("source-record");
+  record.checked = recall("record") !== "no"; // what was not recorded is lost
+  record.addEventListener("change", () => remember("record", record.checked ? "yes" : "no"));
+  const show = () => { byId("source-recorded").hidden = !LIVE.test(uri()) && !byId("source-robot").open; };
+  byId("source-uri").addEventListener("input", show);
+  byId("source-robot").addEventListener("toggle", show);
+}
