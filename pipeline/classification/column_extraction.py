@@ -9,7 +9,7 @@ from pipeline.classification.voxel_map import SIDE, SLICE, SLICES
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import RING_FAR, Bool, Float32, Int, Int32
+from pipeline.types.records import RING_FAR, Float32, Int, Int32
 
 BREAST = 1.3  # m above the ground; height of the position of an axis, also in the examples of the classifier
 BUCKET = RING_FAR  # m; radius of the neighbourhood of a column
@@ -30,7 +30,7 @@ def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Floa
     """Return the candidates for columns with their foot in or near a square tile.
 
     The search uses all heights up to 3 m, and then the low ones only, where a trunk is visible below a crown
-    that dominates the count over all heights. A column that both searches find appears twice.
+    that dominates the count over all heights. A candidate of both searches is returned once.
 
     Args:
         mean: Voxels in and around the tile: x, y in the map and height above the ground, shape (N, 3) [m].
@@ -46,15 +46,19 @@ def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Floa
     reach, border = round(APART / SIDE), round((MARGIN - MOVES) / SIDE)
     columns = np.empty((cells * cells // 4, 5))
     n = 0
-    for high in (HIGH, LOW_HIGH):
-        strength = _strength(mean, returns, low, cells, high)
+    strength, below = _strengths(mean, returns, low, cells)
+    for search in range(2):
+        searched = strength if search == 0 else below
         for i in range(border, cells - border):
             for j in range(border, cells - border):
-                if strength[i, j] > 0.0 and _is_peak(strength, i, j, reach):
-                    columns[n, 0] = low[0] - MARGIN + (i + 0.5) * SIDE
-                    columns[n, 1] = low[1] - MARGIN + (j + 0.5) * SIDE
-                    columns[n, 2], columns[n, 3], columns[n, 4] = 0.0, 0.0, strength[i, j]
-                    n += 1
+                if searched[i, j] == 0.0 or not _is_peak(searched, i, j, reach):
+                    continue
+                if search == 1 and strength[i, j] > 0.0 and _is_peak(strength, i, j, reach):
+                    continue
+                columns[n, 0] = low[0] - MARGIN + (i + 0.5) * SIDE
+                columns[n, 1] = low[1] - MARGIN + (j + 0.5) * SIDE
+                columns[n, 2], columns[n, 3], columns[n, 4] = 0.0, 0.0, searched[i, j]
+                n += 1
     return columns[:n]
 
 
@@ -64,7 +68,7 @@ def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
     the first in the order of rows and columns is the peak.
 
     Args:
-        strength: Result of `_strength`, shape (cells, cells).
+        strength: A result of `_strengths`, shape (cells, cells).
         i, j: Row and column of the cell, at least `reach` from the border.
         reach: Half side in cells.
     """
@@ -80,39 +84,40 @@ def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
 
 
 @compiled
-def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) -> Float:
-    """Return for each cell the sum over the slices of log(1 + n), where n is the number of returns in the
-    cell and its eight neighbours; 0 if fewer than LEAST slices have returns. Shape (cells, cells).
+def _strengths(mean: Float32, returns: Int32, low: Float, cells: int) -> tuple[Float, Float]:
+    """Return for each cell the sum over the slices from LOW to below HIGH of log(1 + n), where n is the
+    number of returns in the cell and its eight neighbours; 0 if fewer than LEAST slices have returns, and at
+    the border. The second result is the same for the slices below LOW_HIGH. Shapes (cells, cells).
 
     Args:
         mean, returns, low: See `find_columns`.
         cells: Number of cells per side of the tile with its margin.
-        high: One past the last slice; the first is LOW.
     """
-    block = np.zeros((cells, cells, high - LOW), np.float32)
+    around = np.zeros((cells, cells, HIGH - LOW), np.int32)
+    filled = np.zeros((cells, cells), np.int32)
     for i in range(mean.shape[0]):
         a = int(np.floor((mean[i, 0] - low[0] + MARGIN) / SIDE))
         b = int(np.floor((mean[i, 1] - low[1] + MARGIN) / SIDE))
-        h = int(mean[i, 2] / SLICE)
-        if 0 <= a < cells and 0 <= b < cells and LOW <= h < high:
-            block[a, b, h - LOW] += returns[i]
-    along = np.zeros_like(block)  # sums of three cells along y, then of three such along x
-    for a in range(cells):
-        for b in range(1, cells - 1):
-            for h in range(high - LOW):
-                along[a, b, h] = block[a, b - 1, h] + block[a, b, h] + block[a, b + 1, h]
-    strength = np.zeros((cells, cells))
+        h = int(mean[i, 2] / SLICE) - LOW
+        if 0 <= a < cells and 0 <= b < cells and 0 <= h < HIGH - LOW:
+            for c in range(max(a - 1, 1), min(a + 2, cells - 1)):
+                for d in range(max(b - 1, 1), min(b + 2, cells - 1)):
+                    filled[c, d] += around[c, d, h] == 0
+                    around[c, d, h] += returns[i]
+    strength, below = np.zeros((cells, cells)), np.zeros((cells, cells))
     for a in range(1, cells - 1):
         for b in range(1, cells - 1):
-            total, filled = 0.0, 0
-            for h in range(high - LOW):
-                n = along[a - 1, b, h] + along[a, b, h] + along[a + 1, b, h]
-                if n > 0.0:
-                    filled += 1
-                    total += np.log(1.0 + n)
-            if filled >= LEAST:
-                strength[a, b] = total
-    return strength
+            if filled[a, b] < LEAST:
+                continue
+            total, found = 0.0, 0
+            for h in range(HIGH - LOW):
+                if around[a, b, h] > 0:
+                    found += 1
+                    total += np.log(1.0 + around[a, b, h])
+                if h == LOW_HIGH - LOW - 1 and found >= LEAST:
+                    below[a, b] = total
+            strength[a, b] = total
+    return strength, below
 
 
 @compiled
@@ -273,11 +278,35 @@ def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) 
         for i in range(runs[run, 0], runs[run, 1]):
             h = mean[i, 2]
             s = int(h / SLICE)
-            if s < 0 or s >= SLICES:
-                continue
             dx = mean[i, 0] - axis[0] - axis[2] * (h - BREAST)
             dy = mean[i, 1] - axis[1] - axis[3] * (h - BREAST)
-            _count(dx, dy, float(returns[i]), rows[s], octants[s])
+            n, r2 = float(returns[i]), dx * dx + dy * dy
+            if s < 0 or s >= SLICES or r2 >= RING_FAR * RING_FAR:
+                continue
+            if r2 >= RING_NEAR * RING_NEAR:
+                rows[s, 2] += n
+                octants[s, (dx > 0.0) * 4 + (dy > 0.0) * 2 + (abs(dx) > abs(dy))] = True
+                continue
+            rows[s, ARC] += n
+            rows[s, ARC + 1] += n * dx
+            rows[s, ARC + 2] += n * dy
+            rows[s, ARC + 3] += n * (dx * dx)
+            rows[s, ARC + 4] += n * (dx * dy)
+            rows[s, ARC + 5] += n * (dy * dy)
+            rows[s, ARC + 6] += n * (dx * r2)
+            rows[s, ARC + 7] += n * (dy * r2)
+            rows[s, ARC + 8] += n * (r2 * r2)
+            if r2 >= INSIDE * INSIDE:
+                rows[s, 1] += n
+                continue
+            rows[s, 0] += n
+            rows[s, 3] += 1.0
+            rows[s, 5] += n * dx
+            rows[s, 6] += n * dy
+            rows[s, 7] += n * r2
+            rows[s, 8] += n * dx * dx
+            rows[s, 9] += n * dx * dy
+            rows[s, 10] += n * dy * dy
     for s in range(SLICES):
         rows[s, 4] = octants[s].sum()
         if rows[s, 0] > 0.0:
@@ -287,33 +316,3 @@ def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) 
             rows[s, 8] -= rows[s, 5] * rows[s, 5]
             rows[s, 9] -= rows[s, 5] * rows[s, 6]
             rows[s, 10] -= rows[s, 6] * rows[s, 6]
-
-
-@compiled
-def _count(dx: float, dy: float, n: float, row: Float, octant: Bool) -> None:
-    """Add one voxel to the sums of a slice, see `profile`; a voxel beyond RING_FAR changes nothing.
-
-    Args:
-        dx, dy: Position of the voxel relative to the axis [m].
-        n: Number of returns in the voxel.
-        row: Profile of the slice, shape (PROFILE,), changed in place.
-        octant: Filled octants of the ring, shape (OCTANTS,), changed in place.
-    """
-    r2 = dx * dx + dy * dy
-    if r2 < RING_NEAR * RING_NEAR:
-        for a, v in enumerate((1.0, dx, dy, dx * dx, dx * dy, dy * dy, dx * r2, dy * r2, r2 * r2)):
-            row[ARC + a] += n * v
-    if r2 < INSIDE * INSIDE:
-        row[0] += n
-        row[3] += 1.0
-        row[5] += n * dx
-        row[6] += n * dy
-        row[7] += n * r2
-        row[8] += n * dx * dx
-        row[9] += n * dx * dy
-        row[10] += n * dy * dy
-    elif r2 < RING_NEAR * RING_NEAR:
-        row[1] += n
-    elif r2 < RING_FAR * RING_FAR:
-        row[2] += n
-        octant[(dx > 0.0) * 4 + (dy > 0.0) * 2 + (abs(dx) > abs(dy))] = True
