@@ -163,9 +163,9 @@ def seen_higher(columns: Columns) -> Int:
     """
     c = columns
     gain = _gains(c.viewed, c.met, c.passed, c.figures)
-    rows = np.argsort(-gain, kind="stable")
-    rows = rows[: np.count_nonzero(gain > HIGHER)]
-    _, first = np.unique(c.tile[rows], axis=0, return_index=True)
+    rows = np.flatnonzero(gain > HIGHER)
+    rows = rows[np.argsort(-gain[rows], kind="stable")]
+    _, first = np.unique(_tile_keys(c.tile[rows]), return_index=True)
     tiles: Int = c.tile[rows[np.sort(first)[:MOST_STALE]]]
     return tiles
 
@@ -179,8 +179,9 @@ def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
         met, passed: Rays by slice of height, shape (K, SLICES).
         figures: Features at the classification, shape (K, COUNT).
     """
-    slices = np.arange(met.shape[1])
-    highest = np.where(met + passed > 0, slices, 0).max(axis=1)
+    last = met.shape[1] - 1
+    seen = (met + passed > 0)[:, ::-1]
+    highest = np.where(seen.any(axis=1), last - seen.argmax(axis=1), 0)
     gain: Float = np.maximum(viewed - figures[:, _LOOKED], highest * SLICE - figures[:, _RAYS])
     return gain
 
@@ -425,8 +426,13 @@ def _joined(tiles: Int, more: Int) -> Int:
 
 def _among(home: Int, tiles: Int) -> Bool:
     """Return whether each tile of `home`, int64, shape (K, 2), is among `tiles`, shape (T, 2); shape (K,)."""
-    there: Bool = np.isin((home[:, 0] << 32) + home[:, 1], (tiles[:, 0] << 32) + tiles[:, 1])
+    there: Bool = (_tile_keys(home)[:, None] == _tile_keys(tiles)).any(axis=1)
     return there
+
+
+def _tile_keys(tiles: Int) -> Int:
+    """Return a number of each tile, int64, shape (T,), for tiles of shape (T, 2)."""
+    return (tiles[:, 0] << 32) + tiles[:, 1]
 
 
 @compiled

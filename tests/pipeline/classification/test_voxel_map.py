@@ -91,6 +91,29 @@ def test_a_tile_is_due_when_it_has_grown_and_few_are_due_at_once():
     assert len(memory.due_tiles(1.1)) == MOST_TILES
 
 
+def test_due_tiles_have_a_bounded_number_of_voxels_and_all_have_their_turn(monkeypatch):
+    memory = VoxelMap.empty()
+    memory.add(cloud(1, 3000), 0, MOST)
+    voxels = dict(
+        zip(map(tuple, memory.copy().due_tiles(1.1)), np.bincount(memory.home[: memory.used]), strict=True)
+    )
+    most = 2 * max(voxels.values())
+    monkeypatch.setattr("pipeline.classification.voxel_map.MOST_VOXELS", most)
+    turns = []
+    while len(tiles := memory.due_tiles(1.1)):
+        turns.append(set(map(tuple, tiles)))
+    assert len(turns) > 2
+    assert all(sum(voxels[tile] for tile in tiles) <= most for tiles in turns)
+    assert sorted(tile for tiles in turns for tile in tiles) == sorted(voxels)  # each once
+
+
+def test_one_tile_with_more_voxels_than_the_bound_is_due(monkeypatch):
+    memory = VoxelMap.empty()
+    memory.add(cloud(1, 3000), 0, MOST)
+    monkeypatch.setattr("pipeline.classification.voxel_map.MOST_VOXELS", 1)
+    assert len(memory.due_tiles(1.1)) == 1
+
+
 def test_a_copy_stays_as_it_was():
     memory = VoxelMap.empty()
     memory.add(cloud(1), 0, MOST)
