@@ -345,6 +345,7 @@ class Remapping:
         if rerun.done > until:
             rerun.go_back(*snapshots.newest(until))
         if rerun.done < until:
+            snapshots.expect(until)
             if snapshots.is_due(rerun.done):
                 if isinstance(rerun, TreeRerun):
                     snapshots.share(rerun.done, self._known.snapshots, rerun.mapper.with_trees())
@@ -454,6 +455,15 @@ class Snapshots(Generic[S]):
         if scans in other._files and self.is_due(scans):
             self._files[scans] = other._files[scans][0], change
             self._thin_out()
+
+    def expect(self, scans: int) -> None:
+        """Set the spacing of a run with this number of scans, so that no state is stored that is dropped
+        later; states at other numbers of scans are dropped. The spacing is never reduced."""
+        before = self._spacing
+        while 0 < self._most < (scans - 1) // self._spacing:
+            self._spacing *= 2
+        if self._spacing != before:
+            self._keep(lambda n: n % self._spacing == 0)
 
     def _thin_out(self) -> None:
         """Double the spacing if there are too many states, and drop those at other numbers of scans."""

@@ -26,6 +26,22 @@ def test_states_stay_few_and_evenly_spread_however_long_the_run() -> None:
     assert gaps.pop() <= 20_000 / 10
 
 
+@given(st.lists(st.integers(1, 9_000), min_size=1, max_size=3))
+def test_a_run_of_known_length_stores_only_the_states_that_stay(lengths: list[int]) -> None:
+    thinned: Snapshots[int] = Snapshots(0)
+    planned: Snapshots[int] = Snapshots(0)
+    stored, done = 0, 0
+    for length in sorted(lengths):
+        planned.expect(length)
+        for scans in range(done, length):
+            stored += planned.is_due(scans)
+            thinned.offer(scans, scans)
+            planned.offer(scans, scans)
+        done = length
+        assert planned._files.keys() == thinned._files.keys()
+    assert stored <= len(lengths) * 20
+
+
 def test_states_that_the_disk_refuses_are_not_kept_and_harm_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BlockFile, "put_block", lambda *_: False)
     with closing(Snapshots(0)) as kept:
