@@ -6,10 +6,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -42,11 +41,11 @@ from pipeline.loop_closure.correction import (
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
 from pipeline.map_faults import MapFaults, reasons_of
 from pipeline.odometry.gyro import UNUSED, fused
-from pipeline.slam import FastSlam, Loop, Motion, SlamState
+from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.measured_pose import REJECTED, within_gate
 from pipeline.slam.motion import noise_of, step_covariance
-from pipeline.slam.particle_ancestry import EstimatedPath, TrajectoryBuffer
+from pipeline.slam.particle_ancestry import TrajectoryBuffer
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
 from pipeline.tree_log import (
@@ -54,8 +53,6 @@ from pipeline.tree_log import (
     TreeCorrection,
     TreeInput,
     TreeLog,
-    TreesDifferError,
-    are_same,
     lean,
 )
 from pipeline.types.records import (
@@ -64,13 +61,11 @@ from pipeline.types.records import (
     Frame,
     HeightMap,
     Int,
-    Int32,
     Landmarks,
     Path,
     PoseEstimate,
     Sensor,
     Step,
-    Trees,
     no_detections,
 )
 
@@ -112,14 +107,6 @@ class MapperState:
     last: tuple[Pose2, Float] | None = None
     delayed: PathCorrection | None = None
     faults: MapFaults = field(default_factory=MapFaults)
-
-
-class _Trees(NamedTuple):
-    """Tracks, number of the next new tree, and verdicts of the columns between two scans."""
-
-    tracks: TrackTable
-    next_number: int
-    verdict: Int32
 
 
 Correction = Restart[MapperState] | RelocalisedPose | LoopClosure | DoubledTrees | Smoothing | SearchFailure
@@ -175,8 +162,6 @@ class Mapper:
         #: Stores what each scan gives to the trees; None for no log.
         self.log: TreeLog | None = None
         self._inputs = _Inputs()
-        self._kept: dict[int, _Trees] = {}
-        self._verdict: Int32 = np.zeros(0, np.int32)
 
     def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
         """Map one scan: update path, trees, voxel columns and terrain, correct the map where a loop is closed
@@ -264,6 +249,11 @@ class Mapper:
         return self._slam.state.graph
 
     @property
+    def tracker(self) -> Tracker:
+        """The tracker; the next scan changes its trees."""
+        return self._tracker
+
+    @property
     def tree_landmarks(self) -> Int:
         """Birth number of the landmark of each tree of the last frame, int64, shape (T,), -1 for none; a
         copy."""
@@ -326,60 +316,6 @@ class Mapper:
         """
         self._path = TrajectoryBuffer(stamp_ns, sigma_xy, motion)
         self.restore(state)
-
-    def repeat(self, known: TreeInput) -> Trees:
-        """Make the trees after a scan from its entry in the log of a mapper with other parameters of the
-        trees (`differ_in_trees_only`), and continue the path; return them. SLAM, columns and terrain stay as
-        they are: after the last scan, `restore` a state of that mapper `with_trees`.
-
-        Args:
-            known: The entry of the next scan.
-
-        Raises:
-            TreesDifferError: These trees close another loop.
-        """
-        slam, tracker, path, stamp_ns = self._slam, self._tracker, self._path, known.stamp_ns
-        if known.keeps_state:
-            kept = (*self._kept.items(), (len(path), self._trees()))
-            self._kept = dict(kept[-2:])
-        path.append(stamp_ns, known.step)
-        path.set_sigma(known.estimate.covariance)
-        pose = known.estimate.T_map_base.as_array()
-        slam.state = replace(slam.state, path=slam.state.path.with_pose(pose))
-        if known.seen is not None:
-            tracker.process(stamp_ns, known.estimate, *known.seen)
-        if known.columns is not None:
-            p, columns = self._parameters.classification, known.columns
-            if known.votes is None:
-                tracker.classify_new(replace(columns, verdict=self._verdict))
-            else:
-                columns = replace(columns, verdict=known.votes.verdict(p.tree_share))
-                self._verdict = tracker.classify(stamp_ns, columns, p).verdict
-        if known.search is not None:
-            found = self._search_loop(known.search.history, is_due=known.search.is_due)
-            if not all(map(are_same, found, known.search.found)):
-                raise TreesDifferError
-        for each in known.corrections:
-            tracker.correct(each.correction, path.stamp_ns, each.estimate, each.landmarks, each.of_map)
-            slam.state = replace(slam.state, path=EstimatedPath.of(each.correction.after))
-        if self.log is not None:
-            self.log.put(len(path) - 1, known)
-        return tracker.trees()
-
-    @property
-    def verdict(self) -> Int32:
-        """Verdicts of the columns after `repeat`, int32, shape (C,)."""
-        return self._verdict
-
-    def with_trees(self) -> Callable[[MapperState], MapperState]:
-        """Return a function of the state of another mapper after the scans that were given to `repeat`. It
-        returns the state with the present trees of this mapper, also in the states that are kept for a lost
-        robot."""
-        return partial(_with_all_trees, self._trees(), self._kept)
-
-    def _trees(self) -> _Trees:
-        """Return a copy of the trees of `repeat`."""
-        return _Trees(self._tracker.tracks.copy(), self._tracker.next_number, self._verdict)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Set the pose of the base before scan `index`: all particles are drawn from it, with the map and the
@@ -580,7 +516,7 @@ class Mapper:
         if p.method != "none" and len(self._path) > 1:
             with self._timer("slam"):
                 is_due, known = self._is_search_due(), self._known_history(estimate)
-                loop, displaced = found = self._search_loop(known, is_due=is_due)
+                loop, displaced = found = detection.search_loops(self._history(known), p, is_due=is_due)
                 self._inputs.search = LoopSearch(known, is_due, found)
             if loop is not None:
                 return LoopClosure(loop)
@@ -611,15 +547,6 @@ class Mapper:
             stamp_ns=self._path.stamp_ns, path=self._slam.path(), trees=self._tracker.trees(),
             motion=self._path.motion,
         )  # fmt: skip
-
-    def _search_loop(
-        self, known: Callable[..., detection.RunHistory], *, is_due: bool
-    ) -> tuple[Loop | None, Loop | None]:
-        """Return the loop by a constellation, which is searched for if it is due, and otherwise that by
-        doubled trees."""
-        run, p = self._history(known), self._parameters.relocalisation
-        loop = detection.find_loop(run, p) if is_due else None
-        return loop, detection.find_displaced(run, p) if loop is None else None
 
     def _apply(
         self, index: int, correction: Correction | None, estimate: PoseEstimate
@@ -778,22 +705,3 @@ class _Inputs:
             stamp_ns, step, lean(estimate), self.keeps_state, self.seen, columns, self.votes, self.search,
             self.corrections,
         )  # fmt: skip
-
-
-def _with_all_trees(trees: _Trees, kept: Mapping[int, _Trees], state: MapperState) -> MapperState:
-    """Return a state with other trees, and with those in `kept` in the states that it keeps, by their
-    scans."""
-    states = tuple((index, _with_trees(each, kept[index])) for index, each in state.recovery.kept)
-    return replace(_with_trees(state, trees), recovery=replace(state.recovery, kept=states))
-
-
-def _with_trees(state: MapperState, trees: _Trees) -> MapperState:
-    """Return a state with other trees; the arrays are shared."""
-    gathering = state.gathering
-    columns = replace(gathering.columns, verdict=trees.verdict)
-    return replace(
-        state,
-        tracks=trees.tracks,
-        next_number=trees.next_number,
-        gathering=replace(gathering, columns=columns),
-    )

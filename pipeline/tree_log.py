@@ -2,7 +2,7 @@
 
 Poses, landmarks and columns do not depend on the parameters of the tracks and on the share of votes of a
 tree. After a change of one of these, the trees are made again from this log, without SLAM and without
-columns; see `Mapper.repeat`. Trees act on poses only by the search of loops, which is therefore repeated.
+columns; see `TreeRerun`. Trees act on poses only by the search of loops, which is therefore repeated.
 """
 
 from __future__ import annotations
@@ -110,6 +110,13 @@ class TreeLog:
             names = [f.name for f in fields(columns) if f.name not in ("axis", "share")]
             self._columns = replace(columns, **{name: getattr(columns, name)[:0].copy() for name in names})
         return self._columns
+
+    def until(self, scans: int) -> TreeLog:
+        """Return a log of the first scans, which must be known. The entries are shared."""
+        log = TreeLog()
+        log._scans, log._sizes = self._scans[:scans], self._sizes[:scans]
+        log._nbytes = sum(log._sizes)
+        return log
 
     def at(self, index: int) -> TreeInput:
         """Return the input of a scan; TreesDifferError if it is not known."""

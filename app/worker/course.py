@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from app.common.timers import TOTAL
 from app.explain.records import History, half_axes
 from app.worker.protocol import RunCounts
 from pipeline.geometry.columns import GrowingColumns
-from pipeline.types.records import Float, Frame, Int, Verdict
+from pipeline.types.records import Float, Frame, Int, Trees, Verdict
 from pipeline.types.units import SECOND_NS
 
 
@@ -81,6 +81,10 @@ QUANTITIES: dict[str, Quantity] = {
 }
 
 
+#: Names of the quantities that come from the results of a scan.
+READ_QUANTITIES = tuple(name for name, quantity in QUANTITIES.items() if quantity.read is not None)
+
+
 def read_quantities(frame: Frame) -> dict[str, float]:
     """Return a dict from the names of the quantities that come from the results of a scan (all except
     "driven" and "mapping") to their values in the units of QUANTITIES; NaN if unknown."""
@@ -132,6 +136,19 @@ class ScanSeries:
             if name not in self._columns:
                 self._columns[name] = np.full(self._rows, np.nan)
             self._columns[name][index // self._stride] = value
+
+    def until(self, scans: int, names: Iterable[str]) -> ScanSeries:
+        """Return a copy with the values of these names of the first scans."""
+        other = ScanSeries(self._rows)
+        other._stride = self._stride
+        other._columns = {name: self._columns[name].copy() for name in names if name in self._columns}
+        other.forget_from(scans)
+        return other
+
+    def replace(self, name: str, values: Float) -> None:
+        """Replace the values of `name` of the first scans, shape (N,)."""
+        rows = values[:: self._stride][: self._rows]
+        self._columns.setdefault(name, np.full(self._rows, np.nan))[: len(rows)] = rows
 
     def forget_from(self, index: int) -> None:
         """Remove the values of the scan with this index and of later ones."""
@@ -193,6 +210,13 @@ class ScanCounts:
         if frame.warnings:
             self._warned.append((known, tuple(frame.warnings)))
 
+    def until(self, scans: int) -> ScanCounts:
+        """Return a copy with the first scans."""
+        other = ScanCounts()
+        other._rows = GrowingColumns(*(self._rows.column(k)[:scans] for k in range(2)))
+        other._warned = self._warned[: bisect_left(self._warned, scans, key=_scan_of)]
+        return other
+
     def forget_from(self, index: int) -> None:
         """Remove the scan with this index and later ones."""
         self._rows.return_to(min(index, len(self._rows)))
@@ -253,18 +277,20 @@ class TreeHistory:
         self._rows = GrowingColumns(np.zeros((0, _WIDTH)))
         self._spacing = 1
 
-    def record(self, frame: Frame, start_ns: int) -> None:
-        """Add a row for each tree that the scan detected, confirmed or not. Rows of this scan and of later
+    def record(self, index: int, stamp_ns: int, trees: Trees, start_ns: int) -> None:
+        """Add a row for each tree that a scan detected, confirmed or not. Rows of this scan and of later
         ones are removed first, because the run went back. Once rows were dropped, scans between the kept ones
         add only the first ten estimates of a tree.
 
         Args:
-            frame: Result of the scan.
+            index: Number of the scan.
+            stamp_ns: Time of the scan [ns].
+            trees: Trees after the scan.
             start_ns: Time of the first scan of the run [ns].
         """
         known = self._rows.column(0)
-        first = int(np.searchsorted(known[:, _SCAN], frame.index))
-        self._rows.write(first, self._kept(_rows_of(frame, start_ns)))
+        first = int(np.searchsorted(known[:, _SCAN], index))
+        self._rows.write(first, self._kept(_rows_of(index, stamp_ns, trees, start_ns)))
         while len(self._rows) > _MOST_ROWS and self._spacing < _MOST_ROWS:
             self._spacing *= 2
             self._rows.write(0, self._kept(self._rows.column(0)))
@@ -302,19 +328,18 @@ class TreeHistory:
         return kept
 
 
-def _rows_of(frame: Frame, start_ns: int) -> Float:
-    """Return a row for each tree that the scan detected, shape (R, _WIDTH): scan, number, observations,
+def _rows_of(index: int, stamp_ns: int, trees: Trees, start_ns: int) -> Float:
+    """Return a row for each tree that a scan detected, shape (R, _WIDTH): scan, number, observations,
     time since `start_ns` [s], x, y in the map [m], covariance xx, xy, yy [m^2], DBH [m] and sigma of the
     DBH [m]."""
-    trees = frame.trees
     # A tree that began as a voxel column has a position before any scan detects it.
-    rows = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
+    rows = np.flatnonzero((trees.last_seen_ns == stamp_ns) & (trees.observations > 0))
     return np.column_stack(
         [
-            np.full(len(rows), frame.index),
+            np.full(len(rows), index),
             trees.number[rows],
             trees.observations[rows],
-            np.full(len(rows), (frame.stamp_ns - start_ns) / SECOND_NS),
+            np.full(len(rows), (stamp_ns - start_ns) / SECOND_NS),
             trees.position[rows],
             trees.covariance[rows][:, [0, 0, 1], [0, 1, 1]],
             trees.dbh[rows],

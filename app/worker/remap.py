@@ -4,18 +4,20 @@ reasons."""
 
 from __future__ import annotations
 
+import copy
 import math
+from array import array
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
 
-from app.worker.course import ScanCounts, ScanSeries, TreeHistory, read_quantities
+from app.worker.course import READ_QUANTITIES, ScanCounts, ScanSeries, TreeHistory, read_quantities
 from app.worker.protocol import (
     LENGTH_BYTES,
     MapChanges,
@@ -29,12 +31,14 @@ from pipeline.config import Parameters
 from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.columns import columns_of, rows_in_common, rows_of
+from pipeline.geometry.poses import Pose2
 from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
 from pipeline.remapping.preview import ClusterTable
-from pipeline.remapping.rerun import Rerun, Segment, TreeRerun
+from pipeline.remapping.rerun import Rerun, Segment
+from pipeline.remapping.tree_rerun import TreeRerun, TreesByScan
 from pipeline.seen_area import ViewSelection
-from pipeline.tree_log import TreeLog, differ_in_trees_only
+from pipeline.tree_log import TreeLog, TreesDifferError, differ_in_trees_only
 from pipeline.types.records import Columns, Float, Float32, Frame, Path, Step, Trees, Verdict
 from pipeline.types.units import SECOND_NS
 
@@ -58,6 +62,27 @@ class StoredScan(msgspec.Struct, frozen=True):
     replaced: Path | None
 
 
+class OtherTrees(NamedTuple):
+    """Trees in place of those of stored frames.
+
+    Attributes:
+        by_scan: Trees of each scan.
+        confirmed_s: Time of the first confirmation of each tree by its number [s since the first scan].
+    """
+
+    by_scan: TreesByScan
+    confirmed_s: Mapping[int, float]
+
+    def in_frame(self, frame: Frame, time_s: float) -> tuple[Frame, Float]:
+        """Return the frame of a scan at a time [s since the first scan] with these trees, and the times of
+        their confirmation up to this scan [s], shape (T,); NaN for trees that were not confirmed yet."""
+        trees, verdict = self.by_scan.at(frame.index)
+        columns = None if frame.columns is None else replace(frame.columns, verdict=verdict)
+        confirmed_s = _times_of(trees, self.confirmed_s)
+        confirmed_s[confirmed_s > time_s] = np.nan
+        return replace(frame, trees=trees, columns=columns), confirmed_s
+
+
 class FrameStore:
     """The frames of one map without their points, each with the path and the confirmation times of its time.
 
@@ -75,6 +100,18 @@ class FrameStore:
         self._objects: tuple[object, object] = (None, None)
         self._objects_in = (-1, -1)
         self._read_last: dict[str, tuple[int, object]] = {}  # columns and ground, and the scan that has them
+        self._other_trees: OtherTrees | None = None
+        self._with_other_trees = 0  # first scans that have them
+
+    def with_trees(self, scans: int, other: OtherTrees) -> FrameStore:
+        """Return the frames of the first scans with other trees. The file is shared; what either stores or
+        forgets from now on is not in the other one."""
+        store = copy.copy(self)
+        store._blocks, store._corrections = self._blocks.copy(), list(self._corrections)
+        store._read_last = {}
+        store._other_trees, store._with_other_trees = other, scans
+        store.forget_from(scans)
+        return store
 
     def put(self, frame: Frame, path: Path, time_s: float, confirmed_s: Float) -> None:
         """Store the results of the scan after the last stored one; any other scan is ignored, also one that
@@ -126,12 +163,6 @@ class FrameStore:
         path = None if shown is None else self._path_at(index)
         return None if shown is None or path is None else msgspec.structs.replace(shown, path=path)
 
-    def frame(self, index: int) -> Frame | None:
-        """Return the frame of a scan without points; None as in `read`. Frames that are read in turn share
-        their columns and ground where these did not change."""
-        shown = self._shown(index)
-        return None if shown is None else shown.frame
-
     def _shown(self, index: int) -> Shown | None:
         """Return what `read` returns, without the path."""
         scan = self._read(index)
@@ -147,13 +178,17 @@ class FrameStore:
                     return None
                 self._read_last[name] = number, getattr(holder.shown.frame, name)
             objects[name] = self._read_last[name][1]
-        return msgspec.structs.replace(scan.shown, frame=replace(scan.shown.frame, **objects))
+        frame, confirmed_s = replace(scan.shown.frame, **objects), scan.shown.confirmed_s
+        if self._other_trees is not None and index < self._with_other_trees:
+            frame, confirmed_s = self._other_trees.in_frame(frame, scan.shown.time_s)
+        return msgspec.structs.replace(scan.shown, frame=frame, confirmed_s=confirmed_s)
 
     def forget_from(self, index: int) -> None:
         """Remove the results of the scan with this index and of later ones."""
         if index < self._scans:
             self._path, self._objects = self._path_at(index - 1), (None, None)
             self._scans = index
+        self._with_other_trees = min(self._with_other_trees, index)
         self._blocks.forget_from(index)
         self._read_last.clear()
         self._corrections = [(scan, row) for scan, row in self._corrections if scan < index]
@@ -230,6 +265,7 @@ class RunMap:
         self.confirmed_s: dict[int, float] = {}
         self.views: list[tuple[int, Float]] = []
         self._view_selection, self._newest_ns = ViewSelection(), -1
+        self._view_poses: list[Pose2] = []
         self._start_ns, self._time_s = start_ns, -math.inf
 
     def add(self, frame: Frame, free: Float, times: Mapping[str, float]) -> None:
@@ -242,29 +278,60 @@ class RunMap:
             free: Free range of the scan by direction, shape (BINS,) [m].
             times: Times of mapping the scan for `course`, see `stage_times`; empty if they are unknown.
         """
-        start_ns = self._start_ns()
-        self.history.record(frame, start_ns)
+        time_s = self.add_trees(frame.index, frame.stamp_ns, frame.trees)
         self.clusters.record(frame)
         self.counts.record(frame)
-        time_s = (frame.stamp_ns - start_ns) / SECOND_NS
         self.course.record(frame.index, {"time_s": time_s, **read_quantities(frame), **times})
+        if self.frames is not None:
+            self.frames.put(frame, self.mapper.path, time_s, self.confirmed(frame.trees))
+        self._add_view(frame.stamp_ns, frame.estimate.T_map_base, free)
+
+    def _add_view(self, stamp_ns: int, T_map_base: Pose2, free: Float) -> None:
+        """Add the view of a scan to `views` if it is the newest one and selected."""
+        if stamp_ns > self._newest_ns:
+            self._newest_ns = stamp_ns
+            if self._view_selection.take(T_map_base):
+                self.views.append((stamp_ns, free))
+                self._view_poses.append(T_map_base)
+
+    def add_trees(self, index: int, stamp_ns: int, trees: Trees) -> float:
+        """Add the trees of the scan that was mapped last, with its time [ns], as `add` does. Return the time
+        since the first scan [s]."""
+        start_ns = self._start_ns()
+        self.history.record(index, stamp_ns, trees, start_ns)
+        time_s = (stamp_ns - start_ns) / SECOND_NS
         if time_s <= self._time_s:
             self.confirmed_s = {number: at for number, at in self.confirmed_s.items() if at < time_s}
         self._time_s = time_s
-        for number in frame.trees.number[frame.trees.confirmed].tolist():
+        for number in trees.number[trees.confirmed].tolist():
             self.confirmed_s.setdefault(number, time_s)
-        if self.frames is not None:
-            self.frames.put(frame, self.mapper.path, time_s, self.confirmed(frame.trees))
-        if frame.stamp_ns > self._newest_ns:
-            self._newest_ns = frame.stamp_ns
-            if self._view_selection.take(frame.estimate.T_map_base):
-                self.views.append((frame.stamp_ns, free))
+        return time_s
+
+    def take_results(self, known: RunMap, scans: int, by_scan: TreesByScan, confirmed: Float) -> None:
+        """Take the results of the first scans of another map, which differs in the trees only; the trees are
+        those of `add_trees`.
+
+        Args:
+            known: The other map; unchanged.
+            scans: Number of scans.
+            by_scan: Trees of each scan.
+            confirmed: Number of confirmed trees after each scan, shape (scans,).
+        """
+        self.clusters, self.counts = known.clusters.until(scans), known.counts.until(scans)
+        self.course = known.course.until(scans, ["time_s", *READ_QUANTITIES])
+        self.course.replace("trees", confirmed)
+        if known.frames is not None:
+            self.frames = known.frames.with_trees(scans, OtherTrees(by_scan, dict(self.confirmed_s)))
+        newest_ns = int(self.mapper.path.stamp_ns[-1]) if scans else -1
+        for (stamp_ns, free), pose in zip(known.views, known._view_poses, strict=True):
+            if stamp_ns <= newest_ns:
+                self._add_view(stamp_ns, pose, free)
+        self._newest_ns = newest_ns
 
     def confirmed(self, trees: Trees) -> Float:
         """Return the time at which each tree was first confirmed [s since the first scan], shape (T,); NaN
         for trees that never were."""
-        known = self.confirmed_s
-        return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
+        return _times_of(trees, self.confirmed_s)
 
     def ended(self, trees: Trees) -> dict[int, tuple[float, float]]:
         """Return a dict from the number in this map of each tree that was ever confirmed and is not among
@@ -275,11 +342,11 @@ class RunMap:
     def tree_rerun(self, mapper: Mapper) -> TreeRerun | None:
         """Return the rerun of the trees of this map by a new mapper; None if other parameters differ as well,
         or a scan is not known."""
-        log, frames = self.mapper.log, self.frames
+        log = self.mapper.log
         alike = all(differ_in_trees_only(each, mapper.parameters) for each in self.parameters.sets)
-        if not alike or log is None or frames is None or not log.has_all(self.before.path_length):
+        if not alike or log is None or not log.has_all(self.before.path_length):
             return None
-        return TreeRerun(mapper, log, frames.frame, dict(self.views))
+        return TreeRerun(mapper, log)
 
     def use(self, parameters: Parameters, index: int) -> bool:
         """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
@@ -312,24 +379,22 @@ class RunMap:
             self.frames.close()
 
 
+def _times_of(trees: Trees, times: Mapping[int, float]) -> Float:
+    """Return the time of each tree by its number, shape (T,); NaN for numbers without time."""
+    return np.array([times.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
+
+
 class Remapping:
     """A run that is mapped again from its first scan.
 
     Args:
         rerun: The rerun, with the mapper of the new map.
-        known: The present map.
         new_map: The new map, after the scans that the rerun has done.
         preview: Computes the preview in steps.
     """
 
-    def __init__(
-        self,
-        rerun: Rerun | TreeRerun,
-        known: RunMap,
-        new_map: RunMap,
-        preview: Generator[None, None, None],
-    ) -> None:
-        self.rerun, self._known, self.map, self._preview = rerun, known, new_map, preview
+    def __init__(self, rerun: Rerun, new_map: RunMap, preview: Generator[None, None, None]) -> None:
+        self.rerun, self.map, self._preview = rerun, new_map, preview
 
     def map_next(self, until: int) -> bool:
         """Take the next step of the preview and return False; if the preview is complete, map the next scan
@@ -347,23 +412,71 @@ class Remapping:
         if rerun.done < until:
             snapshots.expect(until)
             if snapshots.is_due(rerun.done):
-                if isinstance(rerun, TreeRerun):
-                    snapshots.share(rerun.done, self._known.snapshots, rerun.mapper.with_trees())
-                else:
-                    snapshots.offer(rerun.done, rerun.mapper.snapshot())
+                snapshots.offer(rerun.done, rerun.mapper.snapshot())
             self.map.add(rerun.map_next(), rerun.free, {})
         return rerun.done == until
 
     def finish(self) -> RunMap:
         """End the rerun and return the new map, whose `before` is then the state after the last scan that the
         rerun mapped."""
-        self.map.before = self.rerun.finish(self._known.before)
+        self.map.before = self.rerun.finish()
         return self.map
 
     def close(self) -> None:
         """Leave the rerun, and delete what is stored of the new map."""
         self._preview.close()
         self.rerun.close()
+        self.map.close()
+
+
+class TreeRemapping:
+    """A run whose trees are made again from its first scan. It is used like a `Remapping`.
+
+    Args:
+        rerun: The rerun, with the mapper of the new map.
+        known: The present map.
+        new_map: The new map, before its first scan.
+        preview: Computes the preview in steps.
+    """
+
+    def __init__(
+        self, rerun: TreeRerun, known: RunMap, new_map: RunMap, preview: Generator[None, None, None]
+    ) -> None:
+        self.rerun, self._known, self.map, self._preview = rerun, known, new_map, preview
+        self._confirmed = array("d")  # number of confirmed trees after each scan
+
+    def map_next(self, until: int) -> bool:
+        """Take the next step of the preview and return False; if the preview is complete, make the trees of
+        the next scan and return whether exactly those of `until` scans are made.
+
+        Raises:
+            TreesDifferError: The whole run must be mapped again.
+        """
+        for _ in self._preview:
+            return False
+        rerun, snapshots = self.rerun, self.map.snapshots
+        if rerun.done > until:
+            raise TreesDifferError
+        if rerun.done < until:
+            snapshots.expect(until)
+            if snapshots.is_due(rerun.done):
+                snapshots.share(rerun.done, self._known.snapshots, rerun.with_trees())
+            index, (stamp_ns, trees) = rerun.done, rerun.map_next()
+            self.map.add_trees(index, stamp_ns, trees)
+            self._confirmed.append(float(np.count_nonzero(trees.confirmed)))
+        return rerun.done == until
+
+    def finish(self) -> RunMap:
+        """End the rerun and return the new map, whose `before` is then the state after the last scan whose
+        trees are made. Raises TreesDifferError if the run went elsewhere."""
+        known, rerun = self._known, self.rerun
+        self.map.before = rerun.finish(known.before, known.mapper.path, known.mapper.motion)
+        self.map.take_results(known, rerun.done, rerun.by_scan, np.array(self._confirmed))
+        return self.map
+
+    def close(self) -> None:
+        """Leave the rerun, and delete what is stored of the new map."""
+        self._preview.close()
         self.map.close()
 
 

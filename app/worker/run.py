@@ -24,6 +24,7 @@ from app.worker.remap import (
     NOT_OF_THE_MAP,
     Remapping,
     RunMap,
+    TreeRemapping,
     segment_ahead,
 )
 from app.worker.tree_numbers import TreeNumbers
@@ -111,7 +112,7 @@ class Run:
         self._numbers = TreeNumbers()
         self._views_sent = 0
         self._odometry_xy = GrowingColumns(np.zeros((0, 2)))  # x, y of each scan
-        self._remapping: Remapping | None = None
+        self._remapping: Remapping | TreeRemapping | None = None
         self._previous: RunMap | None = None  # the map before the last change of parameters, for undo
 
     def _new_map(self, mapper: Mapper) -> RunMap:
@@ -335,22 +336,26 @@ class Run:
             done = previous.before.path_length
             rest = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
             no_preview: Generator[None, None, None] = (None for _ in ())  # only the current scan is left
-            self._remapping = Remapping(rest, self._map, previous, no_preview)
+            self._remapping = Remapping(rest, previous, no_preview)
             return
         if previous is not None:
             previous.close()
         mapper = self._make_mapper(parameters)
         new_map = self._new_map(mapper)
-        rerun = self._map.tree_rerun(mapper) or Rerun(mapper, cache, reread, segment_ahead)
         preview = self._preview_steps(parameters, mapper, on_preview)
-        self._remapping = Remapping(rerun, self._map, new_map, preview)
+        tree_rerun = self._map.tree_rerun(mapper)
+        if tree_rerun is not None:
+            self._remapping = TreeRemapping(tree_rerun, self._map, new_map, preview)
+            return
+        rerun = Rerun(mapper, cache, reread, segment_ahead)
+        self._remapping = Remapping(rerun, new_map, preview)
 
     def _whole_remapping(self, parameters: Parameters) -> Remapping:
         """Return a rerun of all scans without preview."""
         mapper, no_preview = self._make_mapper(parameters), (None for _ in ())
         reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
         rerun = Rerun(mapper, cache, reread, segment_ahead)
-        return Remapping(rerun, self._map, self._new_map(mapper), no_preview)
+        return Remapping(rerun, self._new_map(mapper), no_preview)
 
     def _preview_steps(
         self, parameters: Parameters, mapper: Mapper, on_preview: Callable[[Trees], None]

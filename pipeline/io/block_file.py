@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
 import weakref
 from array import array
@@ -25,6 +26,15 @@ _DISK = Path("/var/tmp")  # noqa: S108 - the default may be in memory; the files
 LARGE = _DISK if _DISK.is_dir() else None
 
 
+class _File:
+    """An open file without a name, its length, and the number of the indices that have blocks in it."""
+
+    def __init__(self, handle: Any) -> None:  # noqa: ANN401 - its class depends on the operating system
+        self.handle = handle
+        self.end, self.users = 0, 1
+        weakref.finalize(self, handle.close)
+
+
 class BlockFile:
     """Compressed blocks of bytes by number, in a file without a name, which is deleted when it is closed.
     Numbers begin at 0; the memory grows with the largest one.
@@ -40,17 +50,24 @@ class BlockFile:
 
     def __init__(self, most: int = MOST_BYTES) -> None:
         """Create the file; an error of the disk appears in `refusal`."""
-        self._file = _unnamed_file()
+        handle = _unnamed_file()
+        self._file = None if handle is None else _File(handle)
         self._most = most
         # Begin (-1: not stored) and length of each block by its number: 12 bytes.
         self._begins, self._lengths = array("q"), array("I")
-        self._end = 0
         self.refusal = self.notice = ""
         self.refused = 0
         if self._file is None:
             self.refusal = "no folder can be written to"
-        else:
-            weakref.finalize(self, self._file.close)
+
+    def copy(self) -> BlockFile:
+        """Return the same blocks with an index of its own: what either stores or forgets from now on is not
+        in the other one. The file is shared, and deleted when both are closed."""
+        other = copy.copy(self)
+        other._begins, other._lengths = self._begins[:], self._lengths[:]
+        if self._file is not None:
+            self._file.users += 1
+        return other
 
     def __len__(self) -> int:
         """Return the number of stored blocks."""
@@ -63,7 +80,7 @@ class BlockFile:
     @property
     def nbytes(self) -> int:
         """Size of the file [bytes]."""
-        return self._end
+        return 0 if self._file is None else self._file.end
 
     def has_all(self, blocks: int) -> bool:
         """Return whether the blocks 0 to `blocks` - 1 are all stored."""
@@ -78,31 +95,32 @@ class BlockFile:
         Returns:
             Whether a block with this number is stored.
         """
-        if self._file is None or index in self:
+        file = self._file
+        if file is None or index in self:
             return index in self
         if len(content) > LARGEST:
             self._refuse(index, f"its data takes more than {LARGEST >> 20} MB")
             return False
         block = zstandard.ZstdCompressor(_LEVEL, write_checksum=True).compress(content)
         try:
-            if self._end + len(block) > self._most:
+            if file.end + len(block) > self._most:
                 self._refuse(index, f"the limit of {self._most / 1e9:.1f} GB is reached")
                 return False
             if index % BLOCKS_BETWEEN_CHECKS == 0 and free_space(LARGE) < SPARE_BYTES + len(block):
                 self._refuse(index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
                 return False
-            self._file.seek(self._end)
+            file.handle.seek(file.end)
             view = memoryview(block)
             while view:
-                view = view[self._file.write(view) or 0 :]
+                view = view[file.handle.write(view) or 0 :]
         except OSError as error:
             self._refuse(index, error.strerror or str(error))
             return False
         missing = index + 1 - len(self._begins)
         self._begins.extend([-1] * missing)
         self._lengths.extend([0] * missing)
-        self._begins[index], self._lengths[index] = self._end, len(block)
-        self._end += len(block)
+        self._begins[index], self._lengths[index] = file.end, len(block)
+        file.end += len(block)
         return True
 
     def read_block(self, index: int, unpack: Callable[[bytes], B]) -> B | None:
@@ -119,8 +137,8 @@ class BlockFile:
         if index not in self or self._file is None:
             return None
         try:
-            self._file.seek(self._begins[index])
-            block = self._file.read(self._lengths[index])
+            self._file.handle.seek(self._begins[index])
+            block = self._file.handle.read(self._lengths[index])
             if not 0 <= zstandard.frame_content_size(block) <= LARGEST:
                 raise ValueError("the size of the block is not valid")
             return unpack(zstandard.ZstdDecompressor().decompress(block))
@@ -131,14 +149,17 @@ class BlockFile:
 
     def forget_from(self, index: int) -> None:
         """Remove the blocks with this number and larger ones. The space after the last block that stays is
-        used again."""
+        used again, unless the file is shared."""
         del self._begins[index:], self._lengths[index:]
-        self._end = max((0, *map(sum, zip(self._begins, self._lengths, strict=True))))
+        if self._file is not None and self._file.users == 1:
+            self._file.end = max((0, *map(sum, zip(self._begins, self._lengths, strict=True))))
 
     def close(self) -> None:
-        """Close and delete the file. Later calls store and return nothing."""
+        """Close the file, which is deleted unless it is shared. Later calls store and return nothing."""
         if self._file is not None:
-            self._file.close()
+            self._file.users -= 1
+            if self._file.users == 0:
+                self._file.handle.close()
             self._file = None
 
     def _refuse(self, index: int, why: str) -> None:

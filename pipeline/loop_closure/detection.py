@@ -94,6 +94,15 @@ def is_uncertain(sigma_xy: Float) -> bool:
     return bool(sigma_xy.max(initial=0.0) > UNSURE)
 
 
+def search_loops(
+    run: RunHistory, parameters: Relocalisation, *, is_due: bool
+) -> tuple[Loop | None, Loop | None]:
+    """Return the loop by a constellation (`find_loop`), which is searched for if it is due, and otherwise
+    that by doubled trees (`find_displaced`); None for none."""
+    loop = find_loop(run, parameters) if is_due else None
+    return loop, find_displaced(run, parameters) if loop is None else None
+
+
 def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
     """Search for a loop that ends at the newest scan.
 

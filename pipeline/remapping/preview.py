@@ -106,6 +106,15 @@ class ClusterTable:
         self.start, self._offsets, self._lost = part.start, part._offsets, part._lost
         self._rows = part._rows
 
+    def until(self, scans: int) -> ClusterTable:
+        """Return a copy with the first scans, which must be in the table."""
+        part, stored = ClusterTable(), -(-scans // self.spacing)
+        part.spacing, part._scans = self.spacing, scans
+        part.start, part._lost = self.start[: stored + 1], self._lost[:stored]
+        part._offsets = self._offsets[: 2 * stored]
+        part._rows = GrowingColumns(*(column[: part.start[-1]] for column in self._columns().values()))
+        return part
+
     def record(self, frame: Frame) -> None:
         """Store the clusters of a mapped scan, and remove those of this and later scans before; a scan beyond
         the next one is ignored. The robot counts as lost if its health is "lost"."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +22,7 @@ from pipeline.geometry.columns import POINT
 from pipeline.io.block_file import MOST_BYTES, BlockFile
 from pipeline.io.checkpoints.codec import record_bytes, record_of
 from pipeline.mapper import Mapper, MapperState
-from pipeline.tree_log import TreeLog, TreesDifferError
-from pipeline.types.records import Columns, Float, Float32, Frame, Int32, Scan, Step, UInt16
+from pipeline.types.records import Float, Float32, Frame, Int32, Scan, Step, UInt16
 
 HIGHEST = SLICES * SLICE  # m above the ground; higher points are not integrated into the columns
 
@@ -219,8 +218,8 @@ class Rerun:
         self.mapper.restore(state)
         self.done, self._segmented = scans, None
 
-    def finish(self, _last: MapperState) -> MapperState:
-        """Close the rerun, and return the state of the mapper. The argument is not used."""
+    def finish(self) -> MapperState:
+        """Close the rerun, and return the state of the mapper."""
         self.close()
         return self.mapper.snapshot()
 
@@ -247,63 +246,3 @@ class Rerun:
                 self._cache.put(step, scan)
                 return step, scan
         raise StemmapError(f"the source does not give scan {index} again", remedy="Open it again")
-
-
-class TreeRerun:
-    """Makes the trees of a run again by other parameters of the trees; poses, columns and terrain are those
-    of the known map. It is used like a `Rerun` and gives the same map.
-
-    Args:
-        mapper: A mapper with the new parameters, before its first scan.
-        log: Log of the known map, which may grow.
-        frame_of: Returns the frame of a scan in the known map; None if it is not stored.
-        free_of: Free ranges by the time of the scan [ns], where they are known.
-    """
-
-    def __init__(
-        self,
-        mapper: Mapper,
-        log: TreeLog,
-        frame_of: Callable[[int], Frame | None],
-        free_of: Mapping[int, Float],
-    ) -> None:
-        self.mapper = mapper
-        self.done = 0
-        self.free: Float = np.zeros(0)
-        self._log, self._frame_of, self._free_of = log, frame_of, free_of
-        self._known: Columns | None = None
-        self._columns: Columns | None = None  # the same with the new verdicts
-
-    def map_next(self) -> Frame:
-        """Make the trees of the next scan, and return its frame, without points.
-
-        Raises:
-            TreesDifferError: The scan is not known, or the trees close another loop, so that the whole run
-                must be mapped again.
-        """
-        known, frame = self._log.at(self.done), self._frame_of(self.done)
-        if frame is None:
-            raise TreesDifferError
-        trees = self.mapper.repeat(known)
-        if frame.columns is not self._known:
-            self._known, self._columns = frame.columns, None
-            if frame.columns is not None:
-                self._columns = replace(frame.columns, verdict=self.mapper.verdict)
-        self.done += 1
-        self.free = self._free_of.get(frame.stamp_ns, self.free)
-        return replace(frame, trees=trees, columns=self._columns)
-
-    def go_back(self, _scans: int, _state: MapperState) -> None:
-        """Raise TreesDifferError: a rerun of the trees only goes on."""
-        raise TreesDifferError
-
-    def finish(self, last: MapperState) -> MapperState:
-        """Restore the last state of the known map with the new trees, and return it; TreesDifferError if it
-        is not the state after the scans that are mapped."""
-        if last.path_length != self.done:
-            raise TreesDifferError
-        self.mapper.restore(self.mapper.with_trees()(last))
-        return self.mapper.snapshot()
-
-    def close(self) -> None:
-        """Do nothing; there is no source."""

@@ -8,6 +8,7 @@ landmark, or is removed. Of two landmarks of its trunk it takes the better one.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +54,12 @@ class Tracker:
         self.tracks = TrackTable.empty()
         nothing = np.zeros((3, 3))
         self._scan = ScanPose(0, np.zeros(3), nothing, nothing)  # of the last scan
+
+    def copy(self) -> Tracker:
+        """Return an independent copy."""
+        other = copy.copy(self)
+        other.tracks = self.tracks.copy()
+        return other
 
     def process(
         self,

@@ -13,6 +13,7 @@ from app.explain.records import half_axes
 from app.worker import course as module
 from app.worker.course import TreeHistory
 from app.worker.outbox import RecentScans
+from pipeline.types.records import Frame
 from tests.app.fakes import PERIOD_NS, START_NS, frame
 
 
@@ -31,12 +32,16 @@ def seen(index: int, x: float, numbers: tuple[int, ...] = (1, 2), observations: 
     return replace(shot, trees=trees)
 
 
+def record(history: TreeHistory, shot: Frame) -> None:
+    history.record(shot.index, shot.stamp_ns, shot.trees, START_NS)
+
+
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
 def test_the_history_is_the_newest_pass_up_to_the_newest_scan(scans: list[int]):
     history = TreeHistory()
     known: dict[int, float] = {}
     for turn, index in enumerate(scans):
-        history.record(seen(index, float(turn)), START_NS)
+        record(history, seen(index, float(turn)))
         known = {k: x for k, x in known.items() if k < index} | {index: float(turn)}
     story = history.of(1, 10**6)
     assert story.x == [known[k] for k in sorted(known)]
@@ -48,7 +53,7 @@ def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(module, "_MOST_ROWS", 200)
     history = TreeHistory()
     for index in range(3000):
-        history.record(seen(index, float(index), observations=index + 1), START_NS)
+        record(history, seen(index, float(index), observations=index + 1))
         assert len(history._rows) <= 200
     story = history.of(2, 10**6)
     assert story.x[:10] == [float(k) for k in range(10)]
@@ -58,7 +63,7 @@ def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch
 def test_a_long_history_is_story_with_its_ends():
     history = TreeHistory()
     for index in range(1500):
-        history.record(seen(index, float(index)), START_NS)
+        record(history, seen(index, float(index)))
     story = history.of(1, 10**6)
     assert len(story.x) <= 200
     assert story.x[0] == 0.0

@@ -19,6 +19,7 @@ from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.front_end import SegmentedScan
 from pipeline.mapper import Mapper
+from pipeline.remapping.tree_rerun import TreeRerun
 from pipeline.tree_log import TreesDifferError
 from pipeline.types.records import Frame, Step, Trees
 
@@ -362,10 +363,10 @@ def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeyp
 
 
 def test_where_other_trees_close_another_loop_the_whole_run_is_mapped_again(session, monkeypatch):
-    def differs(_mapper: Mapper, _known: object) -> Trees:
+    def differs(_rerun: TreeRerun) -> None:
         raise TreesDifferError
 
-    monkeypatch.setattr(Mapper, "repeat", differs)
+    monkeypatch.setattr(TreeRerun, "map_next", differs)
     session.set_parameters(LATER, 1, whole=True)
     frame, _ = remapped(session)
     assert (told(frame), told(session.path)) == mapped_with(LATER, frame.index)

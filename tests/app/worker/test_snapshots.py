@@ -56,8 +56,8 @@ def test_a_damaged_state_is_passed_over() -> None:
             kept.offer(scans, scans)
         file, _ = kept._files[100]
         assert file._file is not None
-        file._file.seek(0)
-        file._file.write(b"damaged")
+        file._file.handle.seek(0)
+        file._file.handle.write(b"damaged")
         assert kept.newest(100) == (50, 50)
 
 

@@ -97,8 +97,8 @@ def test_each_set_of_segmentation_parameters_has_its_cache_and_the_last_few_are_
 def test_damaged_scans_are_processed_again_and_a_notice_says_so(cache):
     fill(cache, BASE, run()[0][:SCANS])
     at, length = cache._begins[5], cache._lengths[5]
-    cache._file.seek(at + length // 2)
-    cache._file.write(b"damage")
+    cache._file.handle.seek(at + length // 2)
+    cache._file.handle.write(b"damage")
     read: list[int] = []
 
     def reread(index: int) -> Iterator[Step]:
@@ -129,11 +129,11 @@ def test_a_cache_that_is_too_large_refuses_scans_and_keeps_the_others():
 def test_a_full_disk_refuses_scans_and_keeps_the_others():
     with closing(ScanCaches()) as caches:
         cache = fill(caches.of(BASE), BASE, run()[0][:SCANS])
-        real = os.dup(cache._file.fileno())
+        real = os.dup(cache._file.handle.fileno())
         with open("/dev/full", "rb+", buffering=0) as full:  # noqa: PTH123
-            os.dup2(full.fileno(), cache._file.fileno())
+            os.dup2(full.fileno(), cache._file.handle.fileno())
         fill(cache, BASE, run()[0][SCANS : SCANS + 1])
-        os.dup2(real, cache._file.fileno())
+        os.dup2(real, cache._file.handle.fileno())
         os.close(real)
         assert "No space left" in cache.refusal
         assert len(cache) == SCANS
