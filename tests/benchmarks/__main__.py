@@ -63,7 +63,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--hours", metavar="N", type=flags.positive_number(1000.0, "hours"), help="duration of `campaign`"
     )
-    parser.add_argument("--scans", metavar="N", type=flags.whole_number(1000, 10**8), help="length of `soak`")
+    parser.add_argument(
+        "--scans", metavar="N", type=flags.whole_number(1000, 10**8), help="length of `soak` and `rerun`"
+    )
     parser.add_argument(
         "--starts", metavar="N", type=flags.whole_number(1, 10**5), help="starts of each pair of `localise`"
     )

@@ -25,9 +25,13 @@ _ONE_THREAD = (
 )
 
 
-def environment() -> dict[str, str]:
-    """The environment of a child: every library at one thread."""
-    path = os.pathsep.join(p for p in (str(ROOT), os.environ.get("PYTHONPATH", "")) if p)
+#: Name of the variable with the root of another clone that is measured in place of this one, or beside it.
+CLONE = "STEMMAP_BENCH_CLONE"
+
+
+def environment(root: Path = ROOT) -> dict[str, str]:
+    """The environment of a child: every library at one thread, and the packages of a clone."""
+    path = os.pathsep.join(p for p in (str(root), os.environ.get("PYTHONPATH", "")) if p)
     return {**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "PYTHONPATH": path}
 
 
@@ -50,14 +54,22 @@ def tables_of(name: str) -> list[Table]:
 
 
 class Side:
-    """One of two processes that are measured in turns: a line of JSON goes in, one comes out."""
+    """One of two processes that are measured in turns: a line of JSON goes in, one comes out.
 
-    def __init__(self, module: str, *words: str) -> None:
+    Args:
+        module: Name of the program of the process; of another clone, the file of this one.
+        words: Words of its command line.
+        clone: Clone whose packages it uses.
+    """
+
+    def __init__(self, module: str, *words: str, clone: Path = ROOT) -> None:
         self.name = module
+        file = ROOT.joinpath(*module.split(".")).with_suffix(".py")
+        program = ("-m", module) if clone == ROOT else ("-P", str(file))
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, *words],
-            env=environment(),
-            cwd=ROOT,
+            [sys.executable, *program, *words],
+            env=environment(clone),
+            cwd=clone,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from app.worker.course import READ_QUANTITIES
 from app.worker.process import new_session
 from app.worker.protocol import MapChanges, Open
 from app.worker.run import Run
@@ -360,6 +361,55 @@ def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeyp
     session.seek(0.7)  # from a stored scan, or mapped again
     settle(session)
     assert told(session.run.map_again()) == mapped_with(wanted, 7)[0]
+
+
+def results(session: Session, scans: int) -> list[object]:
+    """What is stored of the first scans, without the times that it took."""
+    run = session.run
+    assert isinstance(run, Run)
+    known = run._map
+    assert known.frames is not None
+    frames = [known.frames.read(index) for index in (3, 4, scans - 1, 0)]
+    course = run.course(READ_QUANTITIES, LAST, stages=False)
+    clusters, path = known.clusters, np.stack([run.path.x, run.path.y, run.path.yaw], axis=1)
+    return [
+        *((shown.frame, shown.path, shown.confirmed_s) if shown else None for shown in frames),
+        course.values,
+        course.time_s,
+        known.counts.totals(scans - 1, [], {}),
+        clusters.places(path[: len(clusters)], BASE),
+        known.views,
+        known.history._rows.column(0),
+        known.confirmed_s,
+        sorted(known.snapshots._files),
+    ]
+
+
+def test_what_is_stored_after_a_change_of_the_trees_is_that_of_a_first_run(session):
+    session.set_parameters(LATER, 1, whole=True)
+    frame, _ = remapped(session)
+    known = results(session, frame.index)
+    with mapped_from_start(LATER, frame.index) as other:
+        assert list(map(deep, known)) == list(map(deep, results(other, frame.index)))
+    session.set_parameters(BASE, 2, whole=True)  # the map before goes on
+    remapped(session)
+    session.advance(1)
+    settle(session)
+    with mapped_from_start(BASE, frame.index + 1) as other:
+        assert list(map(deep, results(session, frame.index))) == list(map(deep, results(other, frame.index)))
+
+
+def deep(value: object) -> object:
+    """Everything that a value holds, bit by bit."""
+    if is_dataclass(value):
+        return tuple(deep(getattr(value, f.name)) for f in fields(value))
+    if isinstance(value, dict):
+        return {key: deep(each) for key, each in value.items()}
+    if isinstance(value, tuple | list):
+        return tuple(map(deep, value))
+    if isinstance(value, np.ndarray):
+        return (value.dtype.str, value.shape, value.tobytes())
+    return repr(value)
 
 
 def test_where_other_trees_close_another_loop_the_whole_run_is_mapped_again(session, monkeypatch):

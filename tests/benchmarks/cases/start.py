@@ -22,6 +22,7 @@ from typing import IO, Any
 from urllib.parse import parse_qs, urlsplit
 
 from pipeline.errors import StemmapError
+from tests.benchmarks.process import CLONE
 from tests.benchmarks.table import Cell, Table, verdict
 from tests.benchmarks.timing import middle
 
@@ -32,8 +33,6 @@ LINE = (
 )
 
 ROOT = Path(__file__).resolve().parents[3]
-#: Root of another clone that is measured in place of this one.
-CLONE = "STEMMAP_BENCH_CLONE"
 HELP_S, DASHBOARD_S, NEW_S = 0.5, 10.0, 30.0  # asked for
 HELP_ROUNDS, DASHBOARD_ROUNDS, NEW_ROUNDS = 11, 3, 3
 LONGEST_S = 900.0

@@ -129,6 +129,7 @@ def test_a_cache_that_is_too_large_refuses_scans_and_keeps_the_others():
 def test_a_full_disk_refuses_scans_and_keeps_the_others():
     with closing(ScanCaches()) as caches:
         cache = fill(caches.of(BASE), BASE, run()[0][:SCANS])
+        assert cache._file is not None
         real = os.dup(cache._file.handle.fileno())
         with open("/dev/full", "rb+", buffering=0) as full:  # noqa: PTH123
             os.dup2(full.fileno(), cache._file.handle.fileno())
