@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.types.records import ALONE, Health
+from pipeline.types.records import ALONE, UNCERTAIN, UNDECIDED, Health
 
 # s; time constant of the running share of scans with a fault. Wheels slip for 1 to 3 s at a root or in mud,
 # and the trees correct the step; of a continuous fault, the share exceeds FAILED after 3.5 s.
@@ -23,6 +23,10 @@ _EFFECTS = {
     "ground": "heights and diameters are not measured, and trees from there on may be missing or wrong",
 }
 KINDS = tuple(_EFFECTS)
+# Reasons of weak poses that are no faults of the map, because nothing contradicts it: good recordings have
+# them for minutes, such as a dense forest (two trees fit) and a park with lawns (no trees, and uncertain
+# until the next ones). A position that is uncertain by more than the distance between trees is "lost".
+_UNCONTRADICTED = (ALONE, UNCERTAIN, UNDECIDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +119,7 @@ def reasons_of(health: Health, *, is_ground_missing: bool, is_empty: bool) -> di
         found["lost"] = health.reason
     if health.doubt:
         found["odometry"] = health.doubt
-    if health.state == "weak" and not health.doubt and not health.reason.startswith(ALONE):
+    if health.state == "weak" and not health.doubt and not health.reason.startswith(_UNCONTRADICTED):
         found["trees"] = health.reason
     if is_ground_missing or is_empty:
         found["ground"] = EMPTY if is_empty else "most scans show no ground (is the LiDAR mounted as stated?)"

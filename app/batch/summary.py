@@ -262,7 +262,8 @@ def left_out_warning(losses: Mapping[str, int], scans: int) -> str:
     """Return a warning if more than LEFT_OUT of the scans of a run were left out; else "".
 
     Args:
-        losses: Dict from reasons to numbers of records that were left out; those of scans begin with "scans".
+        losses: Dict from reasons to numbers of records that were left out; those of whole scans begin with
+            "scans", others do not, such as poses or times of points of scans that are mapped without them.
         scans: Number of mapped scans.
     """
     left_out = {reason: n for reason, n in losses.items() if reason.startswith("scans")}

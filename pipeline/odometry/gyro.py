@@ -31,9 +31,19 @@ BIAS_UNKNOWN, BIAS_KNOWN = 0.01, 5e-4  # rad/s
 WANDERS = 10.0  # s; the error of the bias is constant over this time, so short steps do not average it
 CONTRADICTION, CONTRADICTION_LEAST = 4.0, 0.01  # sigma, rad
 PROOF, ALIKE = 0.1, 3.0  # turn by the wheels [rad] and largest ratio for the gyroscope to agree with them
+# rad; turn by LiDAR odometry after which turns of the opposite sense show a mirror image: ten times PROOF, as
+# the map is called doubtful then.
+MIRROR_PROOF = 1.0
+# Smallest share of the specific force that is vertical, on average over the run: an axis within 25 degrees of
+# gravity. Otherwise the attitude of the unit is unknown, and so is the sense of its turns.
+UPRIGHT = 0.9
 HALF_TRACK = 0.5  # m; slip of the wheels per angle of a wrong turn
 SLIPPED = "the turns of the wheels and the gyroscope differ: the wheels slip"
 UNUSED = "the turns of the LiDAR odometry and the gyroscope differ: the gyroscope is not used there"
+MIRRORED = (
+    "the LiDAR odometry turns against the gyroscope: one axis of the points has the wrong sign, and the map "
+    "is a mirror image, or the gyroscope has the wrong sign, and the map is right"
+)
 
 
 class Gyro:
@@ -47,6 +57,7 @@ class Gyro:
         self._same = 0
         self._turned = (0.0, 0.0, 0.0)
         self._proven = False
+        self._force = (0.0, 0.0)  # sums of the vertical specific force, and of its absolute value
 
     def add(self, imu: Imu, tilt: tuple[float, float], *, standing: bool, needed_ns: int) -> None:
         """Add a finite reading that is later than the last one, as turn rate about the vertical; remove
@@ -67,6 +78,11 @@ class Gyro:
         while self._readings[0][0] < min(needed_ns, imu.stamp_ns) - KEEP_NS:
             self._readings.popleft()
         self._learn_bias(rate, standing=standing)
+        ax, ay, az = (float(a) for a in imu.linear_acceleration)
+        vertical = (ay * math.sin(roll) + az * math.cos(roll)) * math.cos(pitch) - ax * math.sin(pitch)
+        if math.isfinite(vertical):
+            up, total = self._force
+            self._force = (up + vertical, total + math.hypot(ax, ay, az))
 
     def forget_since(self, stamp_ns: int) -> None:
         """Remove the readings from a time [ns] on, whose stamps were wrong."""
@@ -111,6 +127,17 @@ class Gyro:
         self._turned = (way, square, product + by_wheels * turn.angle)
         alike = square < ALIKE * self._turned[2] < ALIKE**2 * square
         self._proven = self._proven or (way >= PROOF and alike)
+
+    @property
+    def is_opposite(self) -> bool:
+        """Whether the rotations by the gyroscope about the vertical, which the specific force gives, are
+        opposite to those of the other source (see `compare`), which sum up to MIRROR_PROOF or more: the slope
+        is between -ALIKE and -1 / ALIKE. False if gravity is not along the z axis."""
+        way, square, product = self._turned
+        up, total = self._force
+        if way < MIRROR_PROOF or abs(up) <= UPRIGHT * total:
+            return False
+        return square < -ALIKE * math.copysign(product, product * up) < ALIKE**2 * square
 
     def turn(self, from_ns: int, to_ns: int) -> Turn | None:
         """Return the rotation between two times [ns] minus the bias [rad], with its sigma [rad]. None if

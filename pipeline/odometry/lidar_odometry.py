@@ -225,7 +225,7 @@ class LidarOdometry:
         scan is not added unless it starts a new map; this is counted too."""
         points, offset_s = self._useful(scan)
         if len(points) < FEWEST:
-            count_loss(self.losses, "scans with too few points for LiDAR odometry")
+            count_loss(self.losses, "poses of scans with too few points for LiDAR odometry")
             return None
         middle_ns = scan.stamp_ns
         if offset_s is not None:
@@ -233,7 +233,7 @@ class LidarOdometry:
             middle_ns, offset_s = scan.stamp_ns + round(1e9 * middle_s), offset_s - middle_s
         before_ns = self._newest_ns
         if before_ns is not None and middle_ns <= before_ns:
-            count_loss(self.losses, "scans whose sweep is not later than that of the scan before")
+            count_loss(self.losses, "poses of scans whose sweep is not later than that of the scan before")
             return None
         self._newest_ns = middle_ns
         sensor = (scan.T_base_lidar or self._T_base_lidar).t
@@ -272,7 +272,7 @@ class LidarOdometry:
                 if difference is None and (np.diag(of_scan) < SHOWN).all():
                     self._shown_ns = middle_ns
             else:
-                count_loss(self.losses, "scans that LiDAR odometry could not place")
+                count_loss(self.losses, "poses of scans that LiDAR odometry could not place")
                 failing_s = (middle_ns - self._registered_ns) * 1e-9
                 covariance = UNKNOWN * (failing_s**2 - (failing_s - span_s) ** 2)
                 T, step = guess, np.linalg.inv(self._T_odom_base) @ guess

@@ -11,7 +11,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2, Pose3, interpolate, wrap_angle
-from pipeline.odometry.gyro import Gyro
+from pipeline.map_faults import DOUBTFUL
+from pipeline.odometry.gyro import MIRRORED, Gyro
 from pipeline.types.records import (
     Bool,
     Imu,
@@ -527,6 +528,8 @@ class Synchroniser:
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
         unreported = self._unreported(scan.stamp_ns)
         turn = self._turn_to(scan.stamp_ns, pose, unreported)
+        if drift is not None and self._gyro.is_opposite:  # wheels may have the wrong sign themselves
+            self._warn(f"{DOUBTFUL} in the whole run: {MIRRORED}")
         odometry_at = None if self._odometry.newest is None else self._odometry.pose_at
         step = Step(
             index=self._index,

@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.geometry.poses import Float
 from pipeline.slam.motion import Noise, OdometryTrust, wrapped
 from pipeline.slam.rigid_shift_test import FAMILIAR, MANY
-from pipeline.types.records import ALONE, SIGMA_XY_MAX, Health, HealthState
+from pipeline.types.records import ALONE, SIGMA_XY_MAX, UNCERTAIN, UNDECIDED, Health, HealthState
 
 # Columns of the statistics of a scan by particle; SHIFT is the deviation x, y [m], yaw [rad] from the
 # odometry.
@@ -371,9 +371,10 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
     applies decides.
 
     "lost": `sigma_xy` is above SIGMA_XY_MAX or NaN; `is_lost`. "weak": a doubt, unless the trees determine
-    the motion reliably; `strange` above 0; `sigma_xy` above SIGMA_GOOD; `found` below FOUND_WEAK; `odometry`
-    above ODOMETRY_WEAK; `innovation` above INNOVATION_WEAK; `ambiguous` above AMBIGUOUS_WEAK; `alone` above
-    ALONE_WEAK. The rules for `found` and `alone` apply only once a well-known landmark was detected.
+    the motion reliably; `strange` above 0; `found` below FOUND_WEAK; `odometry` above ODOMETRY_WEAK;
+    `innovation` above INNOVATION_WEAK; and, where nothing contradicts the pose, `sigma_xy` above SIGMA_GOOD;
+    `ambiguous` above AMBIGUOUS_WEAK; `alone` above ALONE_WEAK. The rules for `found` and `alone` apply only
+    once a well-known landmark was detected.
 
     Args:
         recent: Running statistics after the scan.
@@ -381,23 +382,23 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
         doubt: Reason to doubt the odometry, "" for none.
     """
     if not sigma_xy <= SIGMA_XY_MAX:
-        return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than the distance between trees"
+        return "lost", f"{UNCERTAIN} by {sigma_xy:.1f} m, more than the distance between trees"
     if is_lost(recent):
         return "lost", "the known trees are not found where they should be visible"
     if doubt and not recent.is_tree_motion_reliable:
         return "weak", doubt
     if recent.strange:
         return "weak", "most detections are at places without a tree in the map"
-    if sigma_xy > SIGMA_GOOD:
-        return "weak", f"the position is uncertain by {sigma_xy:.1f} m"
     if recent.mapped and recent.found < FOUND_WEAK:
         return "weak", "most of the known trees are not found where they should be visible"
     if recent.odometry > ODOMETRY_WEAK:
         return "weak", "the trees contradict the odometry"
     if recent.innovation > INNOVATION_WEAK:
         return "weak", "the trees deviate from their map positions by more than their covariances allow"
+    if sigma_xy > SIGMA_GOOD:
+        return "weak", f"{UNCERTAIN} by {sigma_xy:.1f} m"
     if recent.ambiguous > AMBIGUOUS_WEAK:
-        return "weak", "most detections match two trees"
+        return "weak", UNDECIDED
     if recent.mapped and recent.alone > ALONE_WEAK:
         return (
             "weak",

@@ -536,8 +536,11 @@ HealthState = Literal["good", "weak", "lost"]
 #: Standard deviation up to which a position is usable [m]: the usual distance between neighbouring trunks,
 #: beyond which associations become wrong.
 SIGMA_XY_MAX = 1.5
-#: First words of the reason of a weak pose that no tree contradicts, because none is in view.
+#: First words of the reasons of a weak pose that nothing contradicts: no tree is in view, the position is
+#: known less well than a third of the distance between trees, or neighbouring trees fit equally well.
 ALONE = "fewer than two known trees in view"
+UNCERTAIN = "the position is uncertain"
+UNDECIDED = "most detections match two trees"
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,7 +148,7 @@ class Plan:
 
     scenes: tuple[str, ...] = SCENES
     seeds: tuple[int, ...] = SEEDS
-    kinds: tuple[str, ...] = ("wheels", "lidar")
+    kinds: tuple[str, ...] = ("wheels", "imu", "lidar")
     faults: tuple[str, ...] = ()
 
     def variants(self, kind: str) -> list[str]:
@@ -173,8 +173,8 @@ def runs(plan: Plan) -> Iterator[tuple[str, int, str, str, Ended, Ended]]:
             for kind in plan.kinds:
                 good = None
                 for name in plan.variants(kind):
-                    wheels, since = kind == "wheels", time.monotonic()
-                    now = ended(HostileSource(source, records, VARIANTS[name], wheels=wheels))
+                    since = time.monotonic()
+                    now = ended(HostileSource(source, records, VARIANTS[name], kind=kind))
                     good = good or now
                     print(scene, seed, kind, name, now, f"{time.monotonic() - since:.0f} s", flush=True)
                     yield scene, seed, kind, name, now, good
@@ -225,7 +225,9 @@ def main(words: list[str]) -> int:
         "--scenes", default=",".join(SCENES), help="names of scenarios (default: %(default)s)"
     )
     parser.add_argument("--seeds", default="1", help="such as 1-3 (default: %(default)s)")
-    parser.add_argument("--odometry", default="wheels,lidar", help="kinds of odometry (default: %(default)s)")
+    parser.add_argument(
+        "--odometry", default="wheels,imu,lidar", help="kinds of odometry (default: %(default)s)"
+    )
     parser.add_argument("--faults", default="", help="parts of names of faults (default: all)")
     parser.add_argument("--out", type=FilePath, help=f"also write the table, for instance to {OUT.name}")
     chosen = parser.parse_args(words)

@@ -23,27 +23,29 @@ class Variant:
     Attributes:
         records: Makes the faulty records of the right ones; they arrive in the order of the list.
         mounting: What is told of the mounting in place of the truth, T_base_lidar; None for the truth.
-        kinds: Which odometry it concerns: "wheels", "lidar" or both.
+        kinds: What moves the robot: "wheels" (with an IMU), "imu" (LiDAR and IMU), "lidar" (LiDAR alone).
     """
 
     records: Change = lambda records: records
     mounting: Pose3 | None = None
-    kinds: tuple[str, ...] = ("wheels", "lidar")
+    kinds: tuple[str, ...] = ("wheels", "imu", "lidar")
 
 
 class HostileSource:
     """A source with a fault. Its records are kept in memory."""
 
-    def __init__(self, source: Source, records: Sequence[Record], variant: Variant, *, wheels: bool) -> None:
+    def __init__(self, source: Source, records: Sequence[Record], variant: Variant, *, kind: str) -> None:
         """Make the faulty records.
 
         Args:
             source: Source of the right records; stays open.
             records: Its records.
             variant: The fault.
-            wheels: Whether the recording has odometry; without it, it has no IMU either.
+            kind: What the recording has beside scans, see `Variant`.
         """
-        kept = [r for r in records if wheels or not isinstance(r, Odometry | Imu)]
+        wheels, imu = kind == "wheels", kind != "lidar"
+        absent = tuple(each for each, there in ((Odometry, wheels), (Imu, imu)) if not there)
+        kept = [r for r in records if not isinstance(r, absent)]
         self._records = variant.records(kept)
         self._source = source
         known = source.description
@@ -51,7 +53,7 @@ class HostileSource:
             known,
             T_base_lidar=variant.mounting or known.T_base_lidar,
             has_odometry=wheels and known.has_odometry,
-            has_imu=wheels and known.has_imu,
+            has_imu=imu and known.has_imu,
             scans=None,
         )
         self.losses: dict[str, int] = {}
@@ -232,10 +234,10 @@ VARIANTS: dict[str, Variant] = {
     "odometry in mm": Variant(_scaled(1000.0), kinds=("wheels",)),
     "odometry mirrored": Variant(_mirrored, kinds=("wheels",)),
     "odometry frozen for 10 s": Variant(_frozen, kinds=("wheels",)),
-    "gyro of the other sign": Variant(_imu(np.eye(3), -1.0), kinds=("wheels",)),
-    "gyro in degrees": Variant(_imu(np.eye(3), 180.0 / np.pi), kinds=("wheels",)),
-    "IMU turned by 90 degrees about x": Variant(_imu(_ABOUT_X_90), kinds=("wheels",)),
-    "IMU turned by 90 degrees about z": Variant(_imu(_ABOUT_Z_90), kinds=("wheels",)),
+    "gyro of the other sign": Variant(_imu(np.eye(3), -1.0), kinds=("wheels", "imu")),
+    "gyro in degrees": Variant(_imu(np.eye(3), 180.0 / np.pi), kinds=("wheels", "imu")),
+    "IMU turned by 90 degrees about x": Variant(_imu(_ABOUT_X_90), kinds=("wheels", "imu")),
+    "IMU turned by 90 degrees about z": Variant(_imu(_ABOUT_Z_90), kinds=("wheels", "imu")),
     "odometry 0.5 s late": Variant(_later(Odometry, 0.5), kinds=("wheels",)),
     "odometry 0.5 s early": Variant(_later(Odometry, -0.5), kinds=("wheels",)),
     "LiDAR pitched by 10 degrees": Variant(mounting=Pose3.from_euler(_AT, 0.0, np.radians(10.0), 0.0)),

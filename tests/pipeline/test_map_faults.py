@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from pipeline.map_faults import DOUBTFUL, EMPTY, MapFaults, reasons_of
+from pipeline.slam.pose_quality import RunningStatistics, ScanStatistics, pose_health
 from pipeline.types.records import Health
 
 PERIOD_NS = 100_000_000
@@ -68,12 +70,27 @@ def test_the_reasons_are_those_of_the_pose_quality_and_of_the_ground():
     assert reasons(state="lost", reason="no tree is found") == {"lost": "no tree is found"}
     assert reasons(state="good", doubt=DOUBT) == {"odometry": DOUBT}
     assert reasons(state="weak", reason=DOUBT, doubt=DOUBT) == {"odometry": DOUBT}
-    assert reasons(state="weak", reason="most detections match two trees") == {
-        "trees": "most detections match two trees"
-    }
-    assert (
-        reasons(state="weak", reason="fewer than two known trees in view for 9 m: only odometry is used")
-        == {}
-    )
+    strange = "most detections are at places without a tree in the map"
+    assert reasons(state="weak", reason=strange) == {"trees": strange}
     assert "ground" in reasons(ground=True)
     assert reasons(empty=True) == {"ground": EMPTY}
+
+
+@pytest.mark.parametrize(
+    ("recent", "covariance"),
+    [
+        (RunningStatistics(mapped=True, ambiguous=0.9), np.diag([1e-4, 1e-4, 1e-6])),
+        (RunningStatistics(mapped=True, alone=9.0), np.diag([1e-4, 1e-4, 1e-6])),
+        (RunningStatistics(mapped=True), np.diag([0.6**2, 0.6**2, 1e-6])),
+    ],
+)
+def test_a_weak_pose_that_nothing_contradicts_makes_no_map_doubtful(recent, covariance):
+    """Oxford Evo and Victoria Park have such poses for minutes, and right maps."""
+    health = pose_health(recent, ScanStatistics(), 50.0, 50, covariance)
+    assert health.state == "weak"
+    assert reasons_of(health, is_ground_missing=False, is_empty=False) == {}
+
+
+def test_a_lost_position_makes_a_map_doubtful():
+    health = pose_health(RunningStatistics(), ScanStatistics(), 50.0, 50, np.diag([2.0**2, 2.0**2, 1e-6]))
+    assert "lost" in reasons_of(health, is_ground_missing=False, is_empty=False)

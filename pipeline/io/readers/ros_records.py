@@ -334,7 +334,7 @@ class RecordDecoder:
         times = self.times.get(frame)
         scan = scan_of(stamp_ns, columns, times, header_ns)
         if times is not None and len(scan.points) and not has_times(scan):
-            count_loss(losses, "scans without usable times of points, which are not de-skewed")
+            count_loss(losses, "times of points of scans, which are not de-skewed")
         return scan
 
     def _header_ns(self, message: Message) -> int:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.batch.saved_run import RunSource
-from app.batch.summary import breaks_of, driven
+from app.batch.summary import breaks_of, driven, left_out_warning
 from pipeline.types.records import Path
 
 STEP = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.integers(1, 10**10))
@@ -38,3 +38,9 @@ def test_the_same_drive_that_goes_on_is_one():
 def test_no_path_is_no_drive():
     nothing = np.zeros(0)
     assert driven(Path(nothing.astype(np.int64), nothing, nothing, nothing, nothing)) == (0.0, 0.0)
+
+
+def test_only_scans_that_are_not_mapped_count_as_left_out():
+    """LiDAR odometry may not place a scan; the scan is mapped nevertheless."""
+    assert left_out_warning({"poses of scans that LiDAR odometry could not place": 2}, 4) == ""
+    assert "2 of 6 scans" in left_out_warning({"scans without points": 2}, 4)

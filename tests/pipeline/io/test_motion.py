@@ -187,5 +187,5 @@ def test_too_few_points_give_no_pose():
     motion = LidarOdometry(Pose3.identity())
     few = Scan(1, np.ones((5, 3), np.float32))
     assert list(motion.add(few)) == [few]
-    assert motion.losses == {"scans with too few points for LiDAR odometry": 1}
+    assert motion.losses == {"poses of scans with too few points for LiDAR odometry": 1}
     assert moving.description.has_odometry

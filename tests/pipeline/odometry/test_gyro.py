@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
-from pipeline.odometry.gyro import BIAS_UNKNOWN, NOISE, SLIPPED, WANDERS, Gyro, fused
+from pipeline.odometry.gyro import BIAS_UNKNOWN, MIRRORED, NOISE, SLIPPED, WANDERS, Gyro, fused
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing import acquire
 from pipeline.slam.motion import Motion, accumulated
@@ -211,6 +211,38 @@ def test_a_gyroscope_that_never_turned_as_the_wheels_is_not_asked(seen):
     off = FOREST.replace({"acquisition.gyro": False})
     np.testing.assert_array_equal(headings(FOREST, driven)[0], headings(off, driven)[0])
     assert all(step.turn_rate is None for step in driven)
+
+
+def mirror_warnings(lidar_turn, rate, *, up=9.81, by_lidar=True):
+    """The warnings about a mirror image in 12 s on a circle with an IMU that measures the gravity `up`."""
+    covariance = np.diag([1e-6, 1e-6, 1e-8]) if by_lidar else None
+    records = [
+        replace(shaken(ms, rate), linear_acceleration=np.array([0.1, 0.2, up]), orientation=None)
+        for ms in range(0, 12000, 10)
+    ]
+    for ms in range(0, 12001, 100):
+        t = ms * 1e-3
+        pose = Pose3.from_euler(np.array([0.5 * t, 0.0, 0.0]), 0.0, 0.0, lidar_turn * t)
+        records += [Odometry(START + ms * MS, pose, covariance), scan(START + ms * MS)]
+    driven = steps(sorted(records, key=lambda r: r.stamp_ns))
+    return {text for step in driven for text in step.warnings if MIRRORED in text}
+
+
+@pytest.mark.parametrize(("lidar_turn", "rate"), [(0.3, -0.3), (-0.2, 0.19)])
+def test_a_mirror_image_is_contradicted_by_gyroscope_and_gravity(lidar_turn, rate):
+    assert len(mirror_warnings(lidar_turn, rate)) == 1
+    assert len(mirror_warnings(lidar_turn, -rate, up=-9.81)) == 1
+
+
+@pytest.mark.parametrize("up", [9.81, -9.81], ids=["upright", "upside down"])
+@pytest.mark.parametrize("turn", [0.3, -0.3, 0.01])
+def test_an_image_that_is_not_mirrored_is_not_called_so_in_any_attitude_of_the_unit(turn, up):
+    assert mirror_warnings(turn, turn * np.sign(up), up=up) == set()
+
+
+def test_without_gravity_or_with_wheels_nothing_shows_a_mirror_image():
+    assert mirror_warnings(0.3, -0.3, up=0.0) == set()
+    assert mirror_warnings(0.3, -0.3, by_lidar=False) == set()
 
 
 def test_one_mad_reading_turns_no_robot():

@@ -233,7 +233,7 @@ def test_a_scan_whose_middle_is_not_later_than_that_before_has_no_pose():
         odometry = [r for scan in scans for r in motion.add(scan) if isinstance(r, Odometry)]
         assert len(odometry) == 2
         assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(odometry))
-        assert motion.losses == {"scans whose sweep is not later than that of the scan before": 1}
+        assert motion.losses == {"poses of scans whose sweep is not later than that of the scan before": 1}
 
 
 def test_points_of_a_single_ring_have_no_normal_and_are_left_out():
@@ -265,7 +265,7 @@ def test_scans_of_another_place_are_told_as_lost():
     notices = [r.text for r in records if isinstance(r, Notice)]
     assert len(notices) == 1
     assert notices[0].startswith("LiDAR odometry is lost since 1.1 s")
-    assert motion.losses["scans that LiDAR odometry could not place"] >= 6
+    assert motion.losses["poses of scans that LiDAR odometry could not place"] >= 6
 
 
 def test_an_open_field_shows_no_motion_and_is_told():
@@ -283,7 +283,7 @@ def test_an_open_field_shows_no_motion_and_is_told():
     notices = [r.text for r in records if isinstance(r, Notice)]
     assert len(notices) == 1
     assert notices[0].startswith(LOST)
-    assert motion.losses == {"scans that LiDAR odometry could not place": 7}
+    assert motion.losses == {"poses of scans that LiDAR odometry could not place": 7}
     sigma = [
         np.sqrt(np.diag(r.covariance))
         for r in records[2:]
@@ -353,4 +353,4 @@ def test_a_place_after_a_gap_is_told_and_the_map_begins_anew():
     notices = [r.text for scan in scans for r in motion.add(scan) if isinstance(r, Notice)]
     assert len(notices) == 1
     assert notices[0].startswith(f"{LOST} since 0.3 s")
-    assert motion.losses == {"scans that LiDAR odometry could not place": 1}
+    assert motion.losses == {"poses of scans that LiDAR odometry could not place": 1}
