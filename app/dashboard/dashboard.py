@@ -101,6 +101,7 @@ class Dashboard:
         self.check_source = check_source
         self._opening = asyncio.Lock()
         self.exporting = asyncio.Lock()  # during an export, so that exports never take all places of `ask`
+        self.layers: dict[str, tuple[str, bytes]] = {}  # digest and bytes of the newest ones
         self._go = False
         self._show_scene = Throttle(lambda frame, path: self.scene.show(frame, path), pause_s=_SCENE_PAUSE_S)
 

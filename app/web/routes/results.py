@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
+import json
 from collections.abc import Iterator
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
@@ -131,25 +133,50 @@ async def export(
 
 
 async def exported_file(
-    dashboard: Dashboard,
-    run: ShownRun,
-    question: dict[str, Any],
-    there: FilePath,
-    media_type: str = "application/octet-stream",
+    dashboard: Dashboard, run: ShownRun, question: dict[str, Any], there: FilePath
 ) -> Response:
-    """Return the file that a child process exports, one at a time. Its answer has the path of the file as
-    `file`; the question is extended by the folder of the run, "path", and the empty folder of the file,
-    "folder". 422 if the child reports an error or takes too long."""
+    """Return the file that a child process exports, one at a time; see `_asked`. 422 if the child reports an
+    error or takes too long."""
     with as_bad_request():
         async with dashboard.exporting, in_thread(run.folder()) as folder:
-            try:
-                answer = await opening.ask(
-                    {**question, "path": str(folder), "folder": str(there)}, patience_s=_EXPORT_S
-                )
-            except opening.TookTooLongError:
-                raise StemmapError(f"the export takes longer than {_EXPORT_S:.0f} s") from None
-    file = FilePath(answer["file"])
+            file = await _asked(question, folder, there)
+    media_type = "application/octet-stream"
     return FileResponse(file, 200, {"Cache-Control": "no-store"}, media_type, filename=file.name)
+
+
+async def exported_layer(
+    dashboard: Dashboard, run: ShownRun, question: dict[str, Any], there: FilePath
+) -> Response:
+    """Return the GeoJSON that a child process exports, see `_asked`; the bytes of the last answer to the same
+    kind of question if neither the question nor the files of the run have changed, because programs ask every
+    few seconds and a child needs 1.6 s of CPU time. 422 if the child reports an error or takes too long."""
+    with as_bad_request():
+        async with dashboard.exporting, in_thread(run.folder()) as folder:
+            name = f"{question['ask']} {question.get('layer', '')}"
+            key = await asyncio.to_thread(_digest, question, folder)
+            if dashboard.layers.get(name, ("", b""))[0] != key:
+                file = await _asked(question, folder, there)
+                dashboard.layers[name] = (key, await asyncio.to_thread(file.read_bytes))
+            return bytes_reply(dashboard.layers[name][1], GEOJSON)
+
+
+def _digest(question: dict[str, Any], folder: FilePath) -> str:
+    """Return a digest of a question and of the names and contents of the files in a folder."""
+    digest = hashlib.sha256(json.dumps(question).encode())
+    for file in sorted(folder.iterdir()):
+        digest.update(f"{file.name} {file.stat().st_size} ".encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+async def _asked(question: dict[str, Any], folder: FilePath, there: FilePath) -> FilePath:
+    """Return the file that a child process exports. Its answer has the path of the file as `file`; the
+    question is extended by the folder of the run, "path", and the empty folder of the file, "folder".
+    StemmapError if the child reports an error or takes too long."""
+    paths = {"path": str(folder), "folder": str(there)}
+    try:
+        return FilePath((await opening.ask({**question, **paths}, patience_s=_EXPORT_S))["file"])
+    except opening.TookTooLongError:
+        raise StemmapError(f"the export takes longer than {_EXPORT_S:.0f} s") from None
 
 
 @router.get("/layers/{layer}.geojson", dependencies=[ViewerTurn])
@@ -161,7 +188,7 @@ async def layer(
     """Return the trees or the path of the present map as GeoJSON for other programs, which ask again to be up
     to date: in WGS84, or in the frame of a local map; a child process writes it. 409 before the first map."""
     question = {"ask": "layer", "layer": layer}
-    return await exported_file(dashboard, ShownRun.of(dashboard), question, there, GEOJSON)
+    return await exported_layer(dashboard, ShownRun.of(dashboard), question, there)
 
 
 @router.get("/evaluation")

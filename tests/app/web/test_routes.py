@@ -15,6 +15,7 @@ import pytest
 
 from app.common.settings import Files, Settings
 from app.dashboard.dashboard import Dashboard
+from app.sources import opening
 from app.sources.one_step import OneStep
 from app.web.auth import viewer_token
 from app.web.routes.access import permitted_uri
@@ -434,6 +435,27 @@ async def test_layers_for_other_programs_follow_the_run(both: Running) -> None:
     (line,) = path["features"]
     assert (line["geometry"]["type"], line["properties"]) == ("LineString", {"name": "path"})
     assert len(line["geometry"]["coordinates"]) > 1
+
+
+async def test_a_layer_is_made_again_only_after_a_change(
+    both: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    asked, ask = list[str](), opening.ask
+
+    async def counted(question: dict[str, Any], **options: Any) -> dict[str, Any]:
+        asked.append(question["layer"])
+        return await ask(question, **options)
+
+    monkeypatch.setattr(opening, "ask", counted)
+    first, second = [(await client.get("/api/layers/trees.geojson")).content for _ in range(2)]
+    assert first == second
+    assert asked == ["trees"]
+    assert (await client.get("/api/layers/path.geojson")).content != first
+    dashboard.digest = "another recording"
+    assert (await client.get("/api/layers/trees.geojson")).status_code == 200
+    assert asked == ["trees", "path", "trees"]
 
 
 async def test_the_files_of_a_run_of_one_step_are_in_its_coordinates(both: Running) -> None:

@@ -22,7 +22,7 @@ from app.extensions.stand.routes.figure_parameters import FigureParameters
 from app.sources import opening
 from app.web.responses import bytes_reply
 from app.web.routes.access import Dash, Deployment, ViewerTurn
-from app.web.routes.results import GEOJSON, exported_file, folder_of_export
+from app.web.routes.results import exported_file, exported_layer, folder_of_export
 from app.web.routes.runs import Key, is_open_run, run_folder
 
 router = APIRouter(prefix="/api")
@@ -37,7 +37,7 @@ async def plots_layer(dashboard: Dash, there: Annotated[FilePath, Depends(folder
     them. 409 before the first map."""
     run = ShownRun.of(dashboard)
     plots = [(plot.name, mapping(plot.shape)) for plot in plots_of_run(run)]
-    return await exported_file(dashboard, run, {"ask": LAYER, "plots": plots}, there, GEOJSON)
+    return await exported_layer(dashboard, run, {"ask": LAYER, "plots": plots}, there)
 
 
 def _add_export(suffix: str) -> None:
