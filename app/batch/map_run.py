@@ -43,7 +43,7 @@ from pipeline.io.readers.base import Source
 from pipeline.io.result_files import ODOMETRY, RunFiles, seen_text, terrain_text, tum_text
 from pipeline.jit import on_compiling
 from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
-from pipeline.map_faults import DOUBTFUL
+from pipeline.map_faults import DOUBTFUL, EMPTY
 from pipeline.mapper import Mapper
 from pipeline.odometry.lidar_odometry import LOST
 from pipeline.odometry.odometry_override import OdometryOverride
@@ -183,6 +183,9 @@ def _map(
         tally.warned[unconfirmed] += 1
     if left_out_words := left_out_warning(losses, frame.index + 1):
         tally.warned[left_out_words] += 1
+    returns = tally.points["returns"]
+    if returns and tally.points["out of range"] == returns and not any(DOUBTFUL in w for w in tally.warned):
+        tally.warned[f"{DOUBTFUL} in the whole run: {EMPTY}"] += 1  # too short for a fault that lasts
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words

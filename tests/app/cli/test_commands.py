@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -489,6 +490,23 @@ def test_losses_are_said_and_told_by_the_exit_code(tmp_path, capsys, monkeypatch
     assert told.code == 3
     assert "left out: scans" in told.err
     assert json.loads((tmp_path / "run.json").read_text())["scans"] == 20
+
+
+def test_a_short_run_without_a_return_in_range_is_doubtful(tmp_path, capsys, monkeypatch):
+    """Two seconds are too short for a fault that lasts."""
+    from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.types.records import Scan
+
+    whole = SimulatedSource.records
+
+    def in_millimetres(self):
+        for r in whole(self):
+            yield replace(r, points=1000.0 * r.points) if isinstance(r, Scan) else r
+
+    monkeypatch.setattr(SimulatedSource, "records", in_millimetres)
+    told = stemmap(capsys, "map", RUN, "--out", tmp_path)
+    assert told.code == 3
+    assert "are the points in metres?" in told.err
 
 
 def test_standing_still_is_warned_of(tmp_path, capsys):
