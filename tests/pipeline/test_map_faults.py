@@ -85,7 +85,7 @@ def test_the_reasons_are_those_of_the_pose_quality_and_of_the_ground():
     ],
 )
 def test_a_weak_pose_that_nothing_contradicts_makes_no_map_doubtful(recent, covariance):
-    """Oxford Evo and Victoria Park have such poses for minutes, and right maps."""
+    """Real drives through dense forests and parks have such poses for minutes, and right maps."""
     health = pose_health(recent, ScanStatistics(), 50.0, 50, covariance)
     assert health.state == "weak"
     assert reasons_of(health, is_ground_missing=False, is_empty=False) == {}
