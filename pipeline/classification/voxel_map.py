@@ -503,7 +503,8 @@ def _rows_around(tx: int, ty: int, margin: float, tables: _Tables) -> Int:
             while row >= 0:
                 if n == rows.shape[0]:
                     longer = np.empty(2 * n, np.int64)
-                    longer[:n] = rows
+                    for k in range(n):
+                        longer[k] = rows[k]
                     rows = longer
                 rows[n] = row
                 x, y = mean[row, 0], mean[row, 1]

@@ -7,8 +7,8 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
-from itertools import cycle, islice
+from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,22 +25,17 @@ LINE = "The mapper's CPU time for one scan of 16 to 128 rings, stage by stage"
 DATA = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
 CHUNK = 20  # scans of a run that are mapped in its turn
 WARM_SCANS = 5  # mapped and forgotten, so that compiled kernels are loaded
-KITTI_SPEED = 8.6  # m/s, of the car in the three scans
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A run: its source, the first counted scan, one past the last, and how often it is mapped.
-
-    `speed` [m/s] repeats the scans of the source along a straight line; 0 takes the source as it is.
-    """
+    """A run: its source, the first counted scan, one past the last, and how often it is mapped."""
 
     name: str
     uri: str
     first: int
     until: int
     times: int = 1
-    speed: float = 0.0
 
 
 #: The first one is the unit of the ratios. A recording of few scans has only its first second.
@@ -51,7 +46,6 @@ CASES = (
     Case("hesai/40p, 40 rings", "hesai/40p", 0, 1, 10),
     Case("sim:stand, OS1-64", "sim:stand?lidar=os1-64&duration=10", 0, 100),
     Case("kitti, 64 rings", "kitti", 0, 3, 10),
-    Case("kitti, 64 rings, its scans in turns at 8.6 m/s", "kitti", 0, 60, speed=KITTI_SPEED),
     Case("semantickitti, 64 rings", "semantickitti", 0, 1, 10),
     Case("sim:stand, OS0-128", "sim:stand?lidar=os0-128&duration=10", 0, 100),
 )
@@ -146,21 +140,9 @@ def _mapped(case: Case, measured: Measured) -> Iterator[None]:
                 timer=measured.watch,
             )
             given = steps(source.records(), odometry="auto" if about.has_odometry else "static")
-            for step in islice(_driven(list(given), case.speed) if case.speed else given, case.until):
+            for step in islice(given, case.until):
                 measured.map(mapper, step, counts=step.index >= case.first)
                 yield
-
-
-def _driven(given: list[Step], speed: float) -> Iterator[Step]:
-    """Repeat steps without end as of a robot that drives along x at a speed [m/s]."""
-    from pipeline.geometry.poses import Pose2
-
-    period_ns = given[-1].period_ns
-    for k, step in enumerate(cycle(given)):
-        scan = replace(step.scan, stamp_ns=given[0].scan.stamp_ns + k * period_ns)
-        at = Pose2(speed * k * period_ns * 1e-9)
-        since_ns = period_ns if k else 0
-        yield replace(step, index=k, scan=scan, elapsed_ns=k * period_ns, period_ns=since_ns, T_odom_base=at)
 
 
 _COLUMNS = (
