@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -86,14 +85,14 @@ def find_camera(
         base: Name of the base frame.
         topic: Topic of the pictures.
     """
-    channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
+    channels = container.by_number
     near = sorted(
         (channel for channel in channels.values() if channel.msgtype == CAMERA_INFO),
         key=lambda channel: (-shared_parts(channel.topic, topic), channel.topic),
     )
     if not near:
         return None, f"there is no CameraInfo for {topic}"
-    for message in islice(container.messages({near[0].number}, None, {}), 20):
+    for message in container.first({near[0].number}, 20):
         try:
             info = decode(channels[message.channel], message.payload)
             K = np.asarray(info.k if hasattr(info, "k") else info.K, dtype=np.float64).reshape(3, 3)

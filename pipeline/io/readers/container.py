@@ -11,6 +11,7 @@ import struct
 import zlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 
 import lz4.frame
@@ -89,6 +90,21 @@ class Container:
     clock_steps: int = 0
     #: What is counted for a message whose bytes cannot be read.
     unreadable = "messages that cannot be read"
+
+    @property
+    def by_number(self) -> dict[int, Channel]:
+        """New dict from numbers to channels."""
+        return {channel.number: channel for channel in self.channels}
+
+    def first(self, numbers: Collection[int], most: int) -> Iterator[Message]:
+        """Yield the first messages of some channels, at most `most`; those that cannot be read are left out.
+        SourceError if the file cannot be read."""
+        return islice(self.messages(numbers, None, {}), most)
+
+    def last(self, numbers: Collection[int], count: int = TAIL) -> Iterator[Message]:
+        """Yield the messages of some channels from `tail_ns` on, about the last `count`; those that cannot be
+        read are left out. SourceError if the file cannot be read."""
+        return self.messages(numbers, self.tail_ns(numbers, count), {})
 
     def tail_ns(self, numbers: Collection[int], last: int = TAIL) -> int:
         """Return the time of recording [ns] of the `last` message from the end of some channels, of the first

@@ -33,8 +33,9 @@ from pipeline.io.readers.camera import (
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import header_stamp
 from pipeline.io.readers.ouster import with_packets_decoded
-from pipeline.io.readers.ros import EmptyScansError, RosSource
+from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
+from pipeline.io.readers.ros_first_scans import EmptyScansError
 from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed, standard_types
 from pipeline.io.readers.transforms import Extrinsics, TransformTree
 from pipeline.types.records import Notice, Record
@@ -284,9 +285,8 @@ class LiveCamera:
 def fixed_transforms(container: Container) -> TransformTree:
     """Return the fixed transforms in the first FIXED_MESSAGES messages of the topics "tf_static" of a
     container; an empty tree if there are none."""
-    mounting = Extrinsics(container)
-    mounting.read(frozenset(c.number for c in container.channels if is_fixed(c.topic)), frozenset())
-    return mounting.tree
+    fixed = frozenset(channel.number for channel in container.channels if is_fixed(channel.topic))
+    return Extrinsics(container, fixed).tree
 
 
 NAME, VERSION = "stemmap_live.json", 1
@@ -443,8 +443,7 @@ class LiveRecording(MessageSource):
         scans = {c.number: c.count for c in self._container.channels if c.topic == self._run.topics[0]}
         recorded, skipped = sum(scans.values()), sum(len(self._skipped.get(c, ())) for c in scans)
         first_ns = next((m.log_ns for m in self._messages(list(scans), {})), 0)
-        tail_ns = self._container.tail_ns(scans)
-        last_ns = max((m.log_ns for m in self._container.messages(scans, tail_ns, {})), default=first_ns)
+        last_ns = max((m.log_ns for m in self._container.last(scans)), default=first_ns)
         revisions, warnings = tuple(self._notes(PARAMETERS, Revision)), list(known.warnings)
         if self._container.damage:
             warnings.append("the recording is cut or damaged: only whole messages are read")

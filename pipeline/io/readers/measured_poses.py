@@ -10,22 +10,21 @@ from the end of that stretch on.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2, Pose3, wrap_angle
 from pipeline.io.readers.base import SourceDescription
-from pipeline.io.readers.container import Container, Message
+from pipeline.io.readers.container import Message
 from pipeline.io.readers.message_time import Stamped
 from pipeline.io.readers.scan_frames import MovingLink
-from pipeline.io.readers.topics import Topics
 from pipeline.types.records import Int, Odometry, PoseMeasurement
 
 if TYPE_CHECKING:
+    from pipeline.io.readers.ros_messages import TimedMessages
     from pipeline.io.readers.ros_records import RecordDecoder
 
 FEWEST = 8  # positions
@@ -473,8 +472,6 @@ _MOST_READINGS = 60_000
 #: Number of unusable readings after which a source without any usable one is given up.
 _HOPELESS = 200
 
-TimesOf = Callable[[Message, dict[str, int]], Iterator[Stamped[Message | Odometry | MovingLink]]]
-
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
@@ -631,29 +628,18 @@ class FrameAlignments:
     """Aligns the frames of GNSS fixes and of another SLAM, and gives the frames to the decoder.
 
     Args:
-        container: The messages that are known when the source is opened.
         decoder: Decoder of the messages; the frames are stored in its `frames`.
-        topics: Topics that are read.
-        odometry: Numbers of the channels of odometry.
-        times_of: Function of a message and a dict of losses that yields the contents of the message with
-            their times.
+        messages: The messages that are known when the source is opened, with their times.
 
     Attributes:
         numbers: Channels whose messages are used, or may be used later.
         notices: New messages for the user; whoever shows them clears the list.
     """
 
-    def __init__(
-        self,
-        container: Container,
-        decoder: RecordDecoder,
-        topics: Topics,
-        odometry: frozenset[int],
-        times_of: TimesOf,
-    ) -> None:
+    def __init__(self, decoder: RecordDecoder, messages: TimedMessages) -> None:
         """Choose the readings by the topics that are read; nothing is aligned."""
-        self._container, self._decoder, self._odometry = container, decoder, odometry
-        self._times_of = times_of
+        self._decoder, self._messages, self._odometry = decoder, messages, messages.odometry.numbers
+        topics = messages.odometry.topics
         kinds = (
             _Kind("gnss", "gnss", "GNSS", "GNSS fixes", "fixes", "the direction of north", decoder.fix,
                   align_fixes, *FIX_STRETCH, early=False),
@@ -724,10 +710,8 @@ class FrameAlignments:
     def _align_recording(self, alignment: FrameAlignment) -> tuple[Any, str]:
         """Return the frame by the first _MOST_READINGS messages of a recording and a text to be ignored, or
         None and the reason why the frame is unknown. Reading ends when the frame is known or refused."""
-        messages = self._container.messages(alignment.readings | self._odometry, None, {})
-        for message in islice(messages, _MOST_READINGS):
-            for stamped in self._times_of(message, {}):
-                found = alignment.add(stamped)
-                if found is not None or alignment.refused:
-                    return found, alignment.refused
+        for stamped in self._messages.read(alignment.readings | self._odometry, {}, most=_MOST_READINGS):
+            found = alignment.add(stamped)
+            if found is not None or alignment.refused:
+                return found, alignment.refused
         return alignment.finish()

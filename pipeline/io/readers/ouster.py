@@ -247,7 +247,7 @@ class PacketRecording(Container):
             kind = next((each for numbers, each in role if channel.number in numbers), channel.msgtype)
             encoding = "cdr" if kind != channel.msgtype else channel.encoding
             channels.append(replace(channel, msgtype=kind, encoding=encoding))
-        self._recorded = {channel.number: channel for channel in container.channels}
+        self._recorded = container.by_number
         self._fixed = max(self._recorded) + 1
         channels.append(Channel(self._fixed, "/tf_static", TRANSFORMS, "cdr"))
         rows = container.index

@@ -195,24 +195,26 @@ class RecordDecoder:
     Args:
         channels: Dict from numbers to channels of the recording.
         tree: Fixed transforms.
+        poses: Numbers of the channels with poses of another SLAM.
 
     Attributes:
         base: Name of the base frame; "" if there is none.
         frames: Dict from the roles "gnss" and "pose" to the frames of their measurements, GnssFrame and
             OtherFrame. Readings of a role that is missing are not used.
-        poses: Numbers of the channels with poses of another SLAM.
         levels: Whether the orientations of the IMU are used.
         times: Dict from frames to how the times of the points of their clouds are read; None for no times.
             That of a new frame is decided by its first cloud.
     """
 
-    def __init__(self, channels: Mapping[int, Channel], tree: TransformTree) -> None:
+    def __init__(
+        self, channels: Mapping[int, Channel], tree: TransformTree, poses: frozenset[int] = frozenset()
+    ) -> None:
         """Create a decoder without a base frame and frames of measured poses."""
         self._channels, self._tree = channels, tree
         self._packets = PacketDecoder()
         self.base = ""
         self.frames: dict[str, GnssFrame | OtherFrame] = {}
-        self.poses = frozenset[int]()
+        self._poses = poses
         self.levels = True
         self.times: dict[str, PointTimes | None] = {}
 
@@ -230,7 +232,7 @@ class RecordDecoder:
         try:
             # Damaged numbers may be of any size; the records are checked afterwards.
             with np.errstate(all="ignore"):
-                if message.channel in self.poses:
+                if message.channel in self._poses:
                     return self._other_measurement(message, stamp_ns, losses)
                 if channel.msgtype == ODOMETRY:
                     return self._odometry(message, stamp_ns)
@@ -241,7 +243,7 @@ class RecordDecoder:
                 scan = self.scan(message, stamp_ns, losses)[0]
         except Exception:  # the one place that catches what the generated decoders of rosbags raise
             named = _NAMES.get(channel.msgtype, "scans")
-            if message.channel in self.poses:
+            if message.channel in self._poses:
                 named = "poses of another SLAM"
             count_loss(losses, f"{named} that cannot be read")
             return None

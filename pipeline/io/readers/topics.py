@@ -4,7 +4,7 @@ type, and of several the one with the most messages."""
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -166,6 +166,10 @@ class Topics:
         """Return the numbers of the channels that are read in a role; empty if the role has no topic."""
         topic = self.chosen.get(role)
         return frozenset() if topic is None else topic.numbers
+
+    def without(self, role: str) -> Topics:
+        """Return the topics with none that is read in a role."""
+        return replace(self, chosen={each: topic for each, topic in self.chosen.items() if each != role})
 
     def transforms(self, *, fixed: bool) -> frozenset[int]:
         """Return the numbers of the channels of fixed or of moving transforms."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import chain, islice, pairwise
+from collections.abc import Sequence
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import count_loss
-from pipeline.io.readers.container import Channel, Container, Message
+from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.topics import decode
 from pipeline.types.units import SECOND_NS
 
@@ -105,47 +106,41 @@ _WORLD = ("map", "world", "earth", "odom", "utm")
 
 _UNREADABLE = "transforms that cannot be read"
 
-#: Time of the transform, parent frame, child frame, T_parent_child.
-Link = tuple[int, str, str, Pose3]
+#: Parent and child frame of a transform.
+Link = tuple[str, str]
 
 
 class Extrinsics:
-    """Extrinsics of a recording: its fixed transforms, and the transform that carries the odometry.
+    """Extrinsics of a recording: the transforms in its first messages. Of moving channels, only transforms
+    that do not change and whose parent is not a world frame (_WORLD) are fixed, and the last messages are
+    read too; those of fixed channels replace them. Damaged messages are ignored.
+
+    Args:
+        container: The recording.
+        fixed, moving: Numbers of the channels of fixed and of moving transforms.
 
     Attributes:
         tree: Fixed transforms.
-        odometry_link: (parent, child) of the moving transform with the pose of the robot, or None.
     """
 
-    def __init__(self, container: Container) -> None:
-        """Begin without transforms; nothing is read."""
-        self._container = container
-        self._channels: dict[int, Channel] = {c.number: c for c in container.channels}
+    def __init__(
+        self, container: Container, fixed: frozenset[int], moving: frozenset[int] = frozenset()
+    ) -> None:
+        """Read the transforms. SourceError if the recording cannot be read."""
+        self._container, self._channels = container, container.by_number
         self.tree = TransformTree()
-        self.odometry_link: tuple[str, str] | None = None
-        self._moving: dict[tuple[str, str], None] = {}  # links of moving channels
-        self._moved: list[tuple[str, str]] = []  # those that change
-
-    def read(self, fixed: frozenset[int], moving: frozenset[int]) -> None:
-        """Add the transforms of the first messages of some channels to `tree`. Of moving channels, only
-        transforms that do not change and whose parent is not a world frame (_WORLD) are added, and the last
-        messages are read too; fixed transforms replace them. Damaged messages are ignored.
-
-        Args:
-            fixed, moving: Numbers of the channels of fixed and of moving transforms.
-        """
-        seen, self._moved = self._links(moving, MOVING_MESSAGES)
-        self._moving = dict.fromkeys(seen)
+        seen, self._moved = self._links(moving, MOVING_MESSAGES)  # those that change
+        self._moving = list(seen)
         for (parent, child), pose in seen.items():
             if (parent, child) not in self._moved and parent.split("/")[-1] not in _WORLD:
                 self.tree.add(parent, child, pose)
         for (parent, child), pose in self._links(fixed, FIXED_MESSAGES)[0].items():
             self.tree.add(parent, child, pose)
 
-    def choose_odometry(self, lidar: str, *, live: bool) -> str:
-        """Set `odometry_link` to the transform that carries the robot; it stays None if there is none. Its
-        child is linked to the LiDAR by fixed transforms, or its frames are named as usual. In a recording it
-        changes. Return a message for the user if the only one does not, else "".
+    def odometry_link(self, lidar: str, *, live: bool) -> tuple[Link | None, str]:
+        """Return the moving transform that carries the robot and "", or None and a message for the user if
+        the only one never changes ("" if there is none). Its child is linked to the LiDAR by fixed
+        transforms, or its frames are named as usual. In a recording it changes.
 
         Args:
             lidar: Frame of the LiDAR.
@@ -159,16 +154,15 @@ class Extrinsics:
         ]
         found = [link for link in named if link in linked] + [link for link in named if link in self._moved]
         found += linked + (named if live else [])
-        self.odometry_link = next(iter(found), None)
-        if self.odometry_link is None and named:
-            return (
-                f"the transform from {named[0][0]} to {named[0][1]} never changes: it is not used as odometry"
-            )
-        return ""
+        if not found and named:
+            parent, child = named[0]
+            return None, f"the transform from {parent} to {child} never changes: it is not used as odometry"
+        return next(iter(found), None), ""
 
-    def world_chain(self, frame: str, odometry: str) -> tuple[str, ...]:
+    def world_chain(self, frame: str, odometry: str, link: Link | None) -> tuple[str, ...]:
         """Return the frames from that of a map to that of the odometry along fixed and moving transforms,
-        both included; () if they are not linked. For equal names it is this one name."""
+        both included, without the one that carries the robot, `link`; () if they are not linked. For equal
+        names it is this one name."""
         links = [*self._moving, *self.tree.links()]
         chains: dict[str, tuple[str, ...]] = {frame: (frame,)}
         border = [frame]
@@ -176,53 +170,53 @@ class Extrinsics:
             ahead = [
                 (child, (*chains[parent], child))
                 for parent, child in links
-                if parent in border and child not in chains and (parent, child) != self.odometry_link
+                if parent in border and child not in chains and (parent, child) != link
             ]
             chains.update(ahead)
             border = [child for child, _ in ahead]
         return chains.get(odometry, ())
 
-    def base_frame(self, by_odometry: str, lidar: str) -> str:
+    def base_frame(self, by_odometry: Sequence[str], lidar: str) -> str:
         """Return the base frame: the first one with a fixed transform to the LiDAR, or else the first one, of
-        these: `by_odometry`, the child of the moving transform of the odometry, and those of "base_link",
-        "base_footprint" and "base" that `tree` knows. Names that are "" are skipped; "" if none is left.
+        these: `by_odometry`, and those of "base_link", "base_footprint" and "base" that `tree` knows. Names
+        that are "" are skipped; "" if none is left.
 
         Args:
-            by_odometry: Frame of the robot in the messages of the odometry.
+            by_odometry: Frames of the robot by the odometry.
             lidar: Frame of the LiDAR.
         """
-        moving = "" if self.odometry_link is None else self.odometry_link[1]
         usual = [name for name in ("base_link", "base_footprint", "base") if self.tree.knows(name)]
-        names = [name for name in (by_odometry, moving, *usual) if name]
+        names = [name for name in (*by_odometry, *usual) if name]
         linked = (name for name in names if lidar and self.tree.find(name, lidar) is not None)
         return next(linked, next(iter(names), ""))
 
-    def _links(
-        self, numbers: frozenset[int], limit: int
-    ) -> tuple[dict[tuple[str, str], Pose3], list[tuple[str, str]]]:
-        """Return a dict from (parent, child) to the first pose T_parent_child in the first `limit` messages
+    def _links(self, numbers: frozenset[int], limit: int) -> tuple[dict[Link, Pose3], list[Link]]:
+        """Return a dict from links to the first pose T_parent_child in the first `limit` messages
         of some channels and the last ones, and the list of those that change."""
-        seen: dict[tuple[str, str], Pose3] = {}
-        moved: dict[tuple[str, str], None] = {}
+        seen: dict[Link, Pose3] = {}
+        moved: dict[Link, None] = {}
         if not numbers:
             return seen, []
-        tail_ns = self._container.tail_ns(numbers, _LAST_MESSAGES)
-        first = islice(self._container.messages(numbers, None, {}), limit)
-        for message in chain(first, self._container.messages(numbers, tail_ns, {})):
-            for _stamp, parent, child, pose in self.decode(message, {}):
-                before = seen.setdefault((parent, child), pose)
+        first, last = self._container.first(numbers, limit), self._container.last(numbers, _LAST_MESSAGES)
+        for message in chain(first, last):
+            for _stamp, link, pose in self.decode(message, {}):
+                before = seen.setdefault(link, pose)
                 same = np.allclose(before.R, pose.R, atol=1e-9) and np.allclose(before.t, pose.t, atol=1e-9)
                 if not same:
-                    moved[parent, child] = None
+                    moved[link] = None
         return seen, list(moved)
 
-    def decode(self, message: Message, losses: dict[str, int]) -> list[Link]:
-        """Return the finite transforms of a message, in its order; [] if it is damaged.
+    def decode(
+        self, message: Message, losses: dict[str, int], counted: Link | None = None
+    ) -> list[tuple[int, Link, Pose3]]:
+        """Return the times [ns], links and poses T_parent_child of the finite transforms of a message, in its
+        order; [] if it is damaged.
 
         Args:
             message: The message.
-            losses: Dict from reasons to numbers; damaged messages, and transforms of the odometry that are
-                not finite, are added in place.
+            losses: Dict from reasons to numbers; damaged messages, and transforms of the link `counted` that
+                are not finite, are added in place.
+            counted: The link, None for none.
         """
         try:
             channel = self._channels[message.channel]
@@ -232,14 +226,14 @@ class Extrinsics:
             return []
         links = []
         for stamped in decoded.transforms:
-            parent, child = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
+            link = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
             try:
                 with np.errstate(all="ignore"):
                     pose = pose_of(stamped.transform.translation, stamped.transform.rotation)
             except ValueError:
-                if (parent, child) == self.odometry_link:
+                if link == counted:
                     count_loss(losses, _UNREADABLE)
                 continue
             stamp_ns = int(stamped.header.stamp.sec) * SECOND_NS + int(stamped.header.stamp.nanosec)
-            links.append((stamp_ns, parent, child, pose))
+            links.append((stamp_ns, link, pose))
         return links
