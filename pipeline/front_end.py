@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.classification import depth_image, steepest_by_direction
+from pipeline.classification import view_by_direction
 from pipeline.config import Parameters
 from pipeline.config.stages import Acquisition, Detection
 from pipeline.detection.cluster_shape import describe_stems, no_lift
@@ -60,8 +60,8 @@ class ColumnInput:
     Attributes:
         points: Points of the box in the level sensor frame, float32, shape (N, 3) [m].
         height: Their heights above the ground, float32, shape (N,) [m].
-        steepest: Tangent of the steepest elevation seen by direction (see `steepest_by_direction`).
-        depth: Range of the nearest return by direction and elevation (see `depth_image`).
+        steepest: Tangent of the steepest elevation seen by direction (see `view_by_direction`).
+        depth: Range of the nearest return by direction and elevation (see `view_by_direction`).
         terrain: Ground height below the scan, as `Terrain.height`.
 
     Points, heights and terrain are rounded to the steps of `pipeline.geometry.columns`.
@@ -256,12 +256,12 @@ def _column_input(
     """
     if height is None or terrain is None:
         return None
-    steepest = steepest_by_direction(raw, sensor_offset, sensor.rings > 0)
+    steepest, depth = view_by_direction(raw, sensor_offset, sensor.rings > 0)
     return ColumnInput(
         rounded(boxed, POINT),
         rounded(height, POINT),
         steepest,
-        depth_image(raw),
+        depth,
         rounded(terrain.height, GROUND),
     )
 

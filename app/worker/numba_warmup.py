@@ -33,7 +33,7 @@ PATIENCE_S = 1800.0
 PROGRAMS = ("compile_scans", "map_stems")
 _POLL_S = 0.2
 _OTHER_S = 120.0  # on a quiet machine, the other program ends within a minute
-_KERNELS = 234  # that both programs compile; only the displayed progress depends on it
+_KERNELS = 233  # that both programs compile; only the displayed progress depends on it
 
 
 def compile_ahead() -> None:
@@ -79,10 +79,10 @@ def is_compiled() -> bool:
 def is_front_end_compiled() -> bool:
     """Return whether the kernels of the front end are cached for the current sources, by the kernel that it
     calls last."""
-    from pipeline.classification import depth_image
+    from pipeline.classification import view_by_direction
     from pipeline.jit import is_kept
 
-    return is_kept(depth_image)
+    return is_kept(view_by_direction)
 
 
 def compiled_kernels() -> tuple[int, int]:

@@ -8,7 +8,7 @@ from pipeline.classification.column_classifier import (
     no_columns,
 )
 from pipeline.classification.forest import Forest, ForestOf, package_alone
-from pipeline.classification.ray_statistics import ScanView, depth_image, steepest_by_direction
+from pipeline.classification.ray_statistics import ScanView, view_by_direction
 from pipeline.classification.voxel_map import PackedVoxelMap
 
 __all__ = [
@@ -20,8 +20,7 @@ __all__ = [
     "PackedVoxelMap",
     "ScanView",
     "column_votes",
-    "depth_image",
     "no_columns",
     "package_alone",
-    "steepest_by_direction",
+    "view_by_direction",
 ]

@@ -26,7 +26,7 @@ class ScanView:
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
         clear_range: Free range by direction in the base frame, shape (BINS,) [m].
         steepest: Tangent of the steepest elevation of a return by direction, shape (BINS,).
-        depth: Range of the nearest return, see `depth_image`.
+        depth: Range of the nearest return, see `view_by_direction`.
         terrain: Ground height below the scan, as `Terrain.height`.
     """
 
@@ -45,30 +45,45 @@ NEAR = 0.6  # m; a return this near to a column belongs to it
 
 
 @compiled
-def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> Float:
-    """Return the tangent of the steepest elevation of a return in each direction of the base frame, shape
-    (BINS,); -1 if there is no return beyond 1 m from the sensor, and at least -1.
+def view_by_direction(points: Float32, offset: Float, all_around: bool) -> tuple[Float, UInt16]:
+    """Return how high a scan looks in each direction, and its depth image.
 
     Args:
         points: Points in the level sensor frame, shape (N, 3) [m], finite.
         offset: Position of the sensor in the base frame, shape (3,) [m].
-        all_around: Whether the sensor has the same elevations in all directions, so that the maximum applies
-            to all.
+        all_around: Whether the sensor has the same elevations in all directions, so that the steepest one
+            applies to all.
+
+    Returns:
+        Tangent of the steepest elevation of a return in each direction of the base frame, shape (BINS,); -1
+        if there is no return beyond 1 m from the sensor, and at least -1. Horizontal distance of the nearest
+        return by direction from the sensor and elevation [cm], 0 if there is no return, at most 65535,
+        uint16, shape (BINS, ELEVATIONS); returns within 0.3 m of the sensor, or with an elevation outside of
+        the image, are ignored.
     """
-    steepest = np.full(BINS, -1.0)
+    steepest, depth = np.full(BINS, -1.0), np.zeros((BINS, ELEVATIONS), np.uint16)
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]
         rho = np.sqrt(x * x + y * y)
+        if not rho > 0.3:
+            continue
+        tangent = points[i, 2] / rho
         if rho > 1.0:
             b = direction_bin(x + offset[0], y + offset[1], BINS)
-            steepest[b] = max(steepest[b], points[i, 2] / rho)
+            steepest[b] = max(steepest[b], tangent)
+        e = int(np.floor((tangent - LOWEST) / STEP))
+        if 0 <= e < ELEVATIONS:
+            b = direction_bin(x, y, BINS)
+            before, near = depth[b, e], np.uint16(min(rho * 100.0, 65535.0))
+            # A selection instead of an unpredictable branch.
+            depth[b, e] = near if (before == 0) | (near < before) else before
     if all_around:
         highest = -1.0
         for b in range(BINS):
             highest = max(highest, steepest[b])
         for b in range(BINS):
             steepest[b] = highest
-    return steepest
+    return steepest, depth
 
 
 @compiled
@@ -123,29 +138,6 @@ def update_visibility(
 
 
 @compiled
-def depth_image(points: Float32) -> UInt16:
-    """Return the horizontal distance of the nearest return by direction from the sensor and elevation [cm], 0
-    if there is no return, at most 65535, uint16, shape (BINS, ELEVATIONS). Returns within 0.3 m of the
-    sensor, or with an elevation outside of the image, are ignored.
-
-    Args:
-        points: Points in the level sensor frame, shape (N, 3) [m], finite.
-    """
-    depth = np.zeros((BINS, ELEVATIONS), np.uint16)
-    for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        rho = np.sqrt(x * x + y * y)
-        if rho > 0.3:
-            e = int(np.floor((points[i, 2] / rho - LOWEST) / STEP))
-            if 0 <= e < ELEVATIONS:
-                b = direction_bin(x, y, BINS)
-                near = np.uint16(min(rho * 100.0, 65535.0))
-                if depth[b, e] == 0 or near < depth[b, e]:
-                    depth[b, e] = near
-    return depth
-
-
-@compiled
 def count_rays(
     axis: Float,
     met: Int32,
@@ -164,7 +156,7 @@ def count_rays(
         axis: Axes of the columns, shape (K, 5).
         met, passed: Numbers of rays, shape (K, SLICES), changed in place.
         pose, offset, terrain, range_max: See `update_visibility`.
-        depth: See `depth_image`.
+        depth: See `view_by_direction`.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for k in range(axis.shape[0]):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from app.extensions.learning.examples import UNKNOWN, Examples
-from pipeline.classification import ColumnClassifier, ScanView, depth_image, steepest_by_direction
+from pipeline.classification import ColumnClassifier, ScanView, view_by_direction
 from pipeline.classification.forest import CLASSES, DecisionTrees, Forest
 from pipeline.config import Parameters
 from pipeline.detection.free_space import clear_range
@@ -107,9 +107,9 @@ def columns_of(
         terrain = scan_ground.find_terrain(raw, parameters.ground)
         height = height_above(raw, terrain)
         free = clear_range(raw, scan_ground.in_band(raw, height, parameters.ground), offset)
-        steepest = steepest_by_direction(raw, offset, sensor.rings > 0)
+        steepest, depth = view_by_direction(raw, offset, sensor.rings > 0)
         pose = step.T_odom_base or Pose2()
-        view = ScanView(pose, offset, free, steepest, depth_image(raw), terrain.height)
+        view = ScanView(pose, offset, free, steepest, depth, terrain.height)
         gathering.add(raw, height, step.index, view)
         taken += 1
         if taken in MARKS:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.classification import ColumnClassifier, Forest, ScanView, depth_image, no_columns
+from pipeline.classification import ColumnClassifier, Forest, ScanView, no_columns, view_by_direction
 from pipeline.classification.column_classifier import (
     FOLD,
     GONE_SCANS,
@@ -33,7 +33,14 @@ from tests.pipeline.strategies import detections, track
 
 FOREST = preset("forest")
 NOWHERE_FREE = np.zeros(BINS)
-NOTHING_SEEN = depth_image(np.zeros((0, 3), np.float32))
+
+
+def depth_of(points):
+    """Return the depth image of points, shape (N, 3) [m]."""
+    return view_by_direction(points, np.zeros(3), True)[1]
+
+
+NOTHING_SEEN = depth_of(np.zeros((0, 3), np.float32))
 
 
 def view(free=NOWHERE_FREE, pose=None):
@@ -351,7 +358,7 @@ def person_then_from_afar(steepest):
     stands 20 m behind them as high as that."""
     gathering = ColumnClassifier(preset("forest").classification, all_around=True)
     body = trunk(3.0, 0.0, 0.15, top=1.7)
-    nothing = depth_image(np.zeros((0, 3), np.float32))
+    nothing = depth_of(np.zeros((0, 3), np.float32))
     for k in range(10):
         gathering.add(body, body[:, 2].copy(), k, far_view(nothing, 0.2))
     turn, up = np.meshgrid(np.linspace(-0.05, 0.05, 30), np.linspace(0.0, steepest, 60))
@@ -359,9 +366,7 @@ def person_then_from_afar(steepest):
     few = body[::200].copy()
     few[:, 0] += 12.0  # 15 m before a robot that now stands at -12 m
     for k in range(10, 14):
-        gathering.add(
-            few, few[:, 2].copy(), k, far_view(depth_image(far.astype(np.float32)), steepest, -12.0)
-        )
+        gathering.add(few, few[:, 2].copy(), k, far_view(depth_of(far.astype(np.float32)), steepest, -12.0))
     c = gathering.columns
     return c.figures[np.hypot(c.axis[:, 0] - 3.0, c.axis[:, 1]).argmin()]
 
@@ -376,7 +381,7 @@ def test_few_returns_from_afar_tell_that_a_person_ends():
 
 def test_a_column_asks_once_and_few_at_a_time():
     gathering = ColumnClassifier(preset("forest").classification, all_around=True)
-    nothing = depth_image(np.zeros((0, 3), np.float32))
+    nothing = depth_of(np.zeros((0, 3), np.float32))
     places = [(-6.0, 2.0), (2.0, 2.0), (6.0, -6.0), (10.0, 2.0)]
     points = np.concatenate([trunk(x, y, 0.15, top=1.7) for x, y in places])
     gathering.add(points, points[:, 2].copy(), 0, far_view(nothing, 0.0))

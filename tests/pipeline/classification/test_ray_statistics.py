@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.classification.column_extraction import PROFILE
 from pipeline.classification.features import COUNT, NAMES, UNSEEN, features
-from pipeline.classification.ray_statistics import NEAR, count_rays, depth_image, update_visibility
+from pipeline.classification.ray_statistics import NEAR, count_rays, update_visibility, view_by_direction
 from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.detection.free_space import BEHIND, BINS
 from pipeline.geometry.azimuth_bins import direction_bin
@@ -22,7 +22,7 @@ AXIS = np.array([[6.0, 0.5, 0.0, 0.0, 1.0]])
 def looked(points, pose=(0.0, 0.0, 0.0), offset=(0.0, 0.0, 0.0), farthest=25.0):
     """Rays that met the column and that passed it, by slice; points in the level sensor frame."""
     met, passed = np.zeros((1, SLICES), np.int32), np.zeros((1, SLICES), np.int32)
-    depth = depth_image(np.array(points, np.float32).reshape(-1, 3))
+    _, depth = view_by_direction(np.array(points, np.float32).reshape(-1, 3), np.zeros(3), True)
     count_rays(AXIS, met, passed, np.array(pose), depth, np.array(offset), FLAT, farthest)
     return met[0], passed[0]
 
