@@ -320,7 +320,8 @@ class RunMap:
         self.clusters, self.counts = known.clusters.until(scans), known.counts.until(scans)
         self.course = known.course.until(scans, ["time_s", *READ_QUANTITIES])
         self.course.replace("trees", confirmed)
-        if known.frames is not None:
+        if self.frames is not None and known.frames is not None:
+            self.frames.close()
             self.frames = known.frames.with_trees(scans, OtherTrees(by_scan, dict(self.confirmed_s)))
         newest_ns = int(self.mapper.path.stamp_ns[-1]) if scans else -1
         for (stamp_ns, free), pose in zip(known.views, known._view_poses, strict=True):
