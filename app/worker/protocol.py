@@ -565,6 +565,12 @@ class MessageCodec(Generic[M]):
         packed[:LENGTH_BYTES] = size.to_bytes(LENGTH_BYTES, "little")
         return bytes(packed)
 
+    def body(self, message: M) -> bytes:
+        """Return the encoded message without prefix, for `decode`. Errors as `encode`."""
+        packed = self._encoder.encode(message)
+        check_size(len(packed))
+        return packed
+
     def decode(self, body: bytes) -> M:
         """Return the message decoded from its bytes without the length prefix.
 

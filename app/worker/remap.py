@@ -19,7 +19,6 @@ import numpy as np
 
 from app.worker.course import READ_QUANTITIES, ScanCounts, ScanSeries, TreeHistory, read_quantities
 from app.worker.protocol import (
-    LENGTH_BYTES,
     MapChanges,
     MessageCodec,
     Shown,
@@ -147,7 +146,7 @@ class FrameStore:
         shown = Shown(0, time_s, lean, 0, rows_of(path, slice(0, 0)), confirmed_s)
         scan = StoredScan(shown, columns_in, ground_in, replaced)
         try:
-            if not self._blocks.put_block(frame.index, self._codec.encode(scan)[LENGTH_BYTES:]):
+            if not self._blocks.put_block(frame.index, self._codec.body(scan)):
                 return
         except WireError:  # larger than a message may be: left out, and the next one stores its own objects
             objects, columns_in, ground_in = (None, None), -1, -1
@@ -556,7 +555,7 @@ class Snapshots(Generic[S]):
         file = BlockFile()
         self._files[scans] = file, None
         try:
-            is_stored = file.put_block(0, self._codec.encode(state)[LENGTH_BYTES:])
+            is_stored = file.put_block(0, self._codec.body(state))
         except WireError:  # it is too large
             is_stored = False
         if not is_stored:
