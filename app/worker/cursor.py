@@ -129,17 +129,20 @@ class Cursor:
         return None if self._store is None else self._store.read(index)
 
     def again(self, index: int) -> Iterator[Step]:
-        """Yield the steps from an index on: stored ones, and from the first that is not stored all others by
-        reading the source from its start. These are neither stored nor compared with the steps read before.
-        The position does not change.
+        """Yield the steps from an index on up to the last one that was read: stored ones, and from the first
+        that is not stored all others by reading the source from its start. These are neither stored nor
+        compared with the steps read before. The position does not change.
 
         Raises:
             SourceError: The source cannot be read.
         """
         for number in count(index):
+            if number >= self.known:  # who reads ahead would else read the source from its start
+                return
             step = self.stored(number)
             if step is None:
-                yield from (step for step in islice(self._read(), number, None) if step is not None)
+                steps = islice(self._read(), number, self.known)
+                yield from (step for step in steps if step is not None)
                 return
             yield step
 

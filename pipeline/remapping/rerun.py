@@ -239,10 +239,14 @@ class Rerun:
                 "the scans of a live run cannot be read again, and these parameters need their points",
                 remedy="Open the recording of the run",
             )
-        if self._segmented is None:
-            self._segmented = self._segment_steps(self.mapper.segmenter(), self._reread(index))
-        for step, scan in self._segmented:
-            if step.index == index:
-                self._cache.put(step, scan)
-                return step, scan
+        is_new = False
+        while not is_new:  # a run that goes on has more scans than when reading began
+            is_new = self._segmented is None
+            segmented = self._segmented or self._segment_steps(self.mapper.segmenter(), self._reread(index))
+            self._segmented = segmented
+            for step, scan in segmented:
+                if step.index == index:
+                    self._cache.put(step, scan)
+                    return step, scan
+            self._segmented = None
         raise StemmapError(f"the source does not give scan {index} again", remedy="Open it again")

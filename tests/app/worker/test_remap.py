@@ -363,6 +363,16 @@ def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeyp
     assert told(session.run.map_again()) == mapped_with(wanted, 7)[0]
 
 
+def test_where_all_scans_are_stored_the_source_is_not_read(session, monkeypatch):
+    def nothing() -> Iterator[Step]:
+        raise AssertionError("the source is read")
+
+    monkeypatch.setattr(session._run._cursor, "_read", nothing)
+    session.set_parameters(WIDER, 1, whole=True)
+    frame, _ = remapped(session)
+    assert told(frame) == mapped_with(WIDER, frame.index)[0]
+
+
 def results(session: Session, scans: int) -> list[object]:
     """What is stored of the first scans, without the times that it took."""
     run = session.run
