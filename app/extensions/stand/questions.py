@@ -12,8 +12,9 @@ from pipeline.errors import StemmapError
 if TYPE_CHECKING:
     from app.extensions.stand.plots import SamplePlot
 
-PLOTS_OF_FILE, GEOREFERENCE, REPORT, VISITS, EXPORT, LAYER = (
-    f"{__name__}:{name}" for name in ("plots", "georeference", "report", "visits", "export", "layer")
+PLOTS_OF_FILE, GEOREFERENCE, REPORT, VISITS, EXPORT, LAYER, DETOUR = (
+    f"{__name__}:{name}"
+    for name in ("plots", "georeference", "report", "visits", "export", "layer", "detour")
 )
 
 
@@ -140,6 +141,42 @@ def layer(question: dict[str, Any]) -> dict[str, Any]:
     file = Path(question["folder"]) / "plots.geojson"
     file.write_text(shapes_geojson(placed, frame), encoding="utf-8")
     return {"file": str(file)}
+
+
+def detour(question: dict[str, Any]) -> dict[str, Any]:
+    """Return the way that shows trees without a diameter from further sides, see `shortest_detour`:
+    `points`, a list of x, y [m], `trees`, the numbers of the trees that it completes, and `length_m`; {} if
+    there is none.
+
+    Args:
+        question: The key "path" has the folder of the run, and "sides" the sectors from which each tree
+            without a diameter was seen, see `Trees.sides`, by its number as text.
+
+    Raises:
+        StemmapError: The run cannot be read.
+    """
+    import numpy as np
+
+    from app.batch.run_folder import read_run, read_seen_area
+    from app.extensions.stand.detour import shortest_detour
+
+    run, seen = read_run(Path(question["path"])), read_seen_area(Path(question["path"]))
+    if seen is None or not run.of_drive:
+        return {}
+    sides = [question["sides"].get(str(number)) for number in run.trees.number.tolist()]
+    found = shortest_detour(
+        np.array([run.path.x[-1], run.path.y[-1]]),
+        run.trees.position,
+        0.5 * np.nan_to_num(run.trees.dbh),
+        sides,
+        radians(run.parameters.tracking.dbh_arc_min),
+        seen,
+        run.parameters.obstacles.width,
+    )
+    if found is None:
+        return {}
+    numbers = run.trees.number[found.trees].tolist()
+    return {"points": found.points.round(2).tolist(), "trees": numbers, "length_m": round(found.length, 1)}
 
 
 def _plots_of(question: dict[str, Any]) -> list[SamplePlot]:

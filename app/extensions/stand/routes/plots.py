@@ -15,6 +15,7 @@ from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
@@ -25,7 +26,7 @@ from app.dashboard.shown_run import ShownRun
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plot_files import PLOT, plots_of_run
 from app.extensions.stand.plots import centres_along, plot_of
-from app.extensions.stand.questions import PLOTS_OF_FILE
+from app.extensions.stand.questions import DETOUR, PLOTS_OF_FILE
 from app.extensions.stand.routes.figure_parameters import FigureParameters
 from app.sources import opening
 from app.store.records import Annotation, Content, UnknownError
@@ -126,6 +127,19 @@ async def figures(dashboard: Dash, parameters: FigureParameters) -> Response:
     if dashboard.shown is None:
         return json_reply({"all": None, "plots": None, "problem": ""})
     return json_reply(await asyncio.to_thread(_figures, ShownRun.of(dashboard), parameters))
+
+
+@router.get("/detour", dependencies=[ViewerTurn])
+async def detour(dashboard: Dash) -> Response:
+    """Return the way that shows trees without a diameter from further sides, see
+    `app.extensions.stand.questions.detour`; a child process computes it. 409 before the first map."""
+    run = ShownRun.of(dashboard)
+    trees, sides = run.shown.frame.trees, dict[int, int]()
+    if trees.sides is not None:
+        lacking = trees.confirmed & np.isnan(trees.dbh)
+        sides = dict(zip(trees.number[lacking].tolist(), trees.sides[lacking].tolist(), strict=True))
+    async with in_thread(run.folder()) as folder:
+        return json_reply(await opening.ask({"ask": DETOUR, "path": str(folder), "sides": sides}))
 
 
 @router.post("/plots")

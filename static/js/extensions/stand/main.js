@@ -7,6 +7,7 @@ import { on } from "../../core/store.js";
 import { saveWritten } from "../../core/written_file.js";
 import { toTab } from "../../shell/actions.js";
 import { extend } from "../../shell/extensions.js";
+import { drawDetour, startDetour, toggleDetour } from "./detour.js";
 import { drawPlots } from "./draw.js";
 import { plotKey, settings, startPlotsPanel } from "./panel.js";
 import { clickOn, dragTo, draw, drawing, hoverTo, plots, pressAt, release, SHAPES } from "./plots.js";
@@ -27,6 +28,7 @@ const presentActions = () => [
   ["Report of the run as HTML or PDF: figures, map, plots, trees", "", () => { toTab("plots")(); byId("plots-report").focus(); }, "print page bericht stand inventory"],
   ["Export the map with plots: Shapefile, DXF, XLSX …", "", () => { toTab("trees")(); byId("trees-export").focus(); }, "save download gis cad excel terrain geotiff"],
   ...Object.keys(SHAPES).map((kind) => [`Plots: draw a ${kind} on the map`, "", inPlots(() => draw(kind)), "stand inventory sample area hectare basal"]),
+  ["Coverage: the way that shows trees without DBH from the missing side", "", toggleDetour, "detour dbh diameter route unseen"],
   ["Plots: import a file", "", inPlots(() => byId("plot-import").click()), "geopackage shapefile geojson gis"],
 ];
 
@@ -36,6 +38,7 @@ function start() {
   on("annotations", () => { legend.hidden = !plots().length; });
   byId("trees-export").title = "Trees, path, terrain and plots for GIS, CAD and spreadsheets, and the cloud; in the coordinates that the tab Plots shows";
   startPlotsPanel();
+  startDetour();
 }
 
 extend(import.meta.url, {
@@ -44,6 +47,9 @@ extend(import.meta.url, {
   exportFiles,
   tabs: () => [{ name: "plots", title: "Plots", before: "charts" }],
   pressed: plotKey,
-  drawOnMap: drawPlots,
+  drawOnMap: (pen, view) => {
+    drawPlots(pen, view);
+    drawDetour(pen, view);
+  },
   mapTools: () => [{ busy: drawing, press: pressAt, drag: dragTo, release, hover: hoverTo, click: clickOn }],
 });

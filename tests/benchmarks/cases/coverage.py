@@ -1,0 +1,164 @@
+"""Trees with a diameter after the way of *Coverage* and after driving on as far: stands of `sim:wild`."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+from tests.benchmarks.seeds import chosen_seeds
+from tests.benchmarks.table import Cell, Table
+
+if TYPE_CHECKING:
+    from pipeline.seen_area import SeenRecorder
+    from pipeline.simulation.run import SimulatedRun
+    from pipeline.types.records import Float, Path, Trees
+
+NAME = "coverage"
+LINE = "Trees with a diameter after the way of Coverage, and after driving on for as long"
+SEEDS = range(10)
+SPACING = 1.5  # m, of the waypoints of a drive
+
+
+def run() -> list[Table]:
+    """Ten stands: the drive of the scenario, then the way, or its course for the same length."""
+    rows, shares = list[tuple[Cell, ...]](), list[tuple[float, float, float]]()
+    for seed in chosen_seeds(SEEDS):
+        row, share = _stand(seed)
+        rows.append(row)
+        shares.append(share)
+        print(*row, file=sys.stderr, flush=True)
+    first, on, way = (100.0 * sum(each) / len(shares) for each in zip(*shares, strict=True))
+    rows.append(("all", "", None, first, on, way, way - on))
+    columns = (
+        "seed", "sensor", "length [m]", "first drive [%]", "driven on [%]", "after the way [%]",
+        "gain [points]",
+    )  # fmt: skip
+    return [Table(LINE, columns, tuple(rows), ("Share of the confirmed trees that have a diameter.",))]
+
+
+class _Mapped(NamedTuple):
+    """A mapped run.
+
+    Attributes:
+        path: The estimated path.
+        trees: The confirmed trees.
+        seen: What its scans observed.
+    """
+
+    path: Path
+    trees: Trees
+    seen: SeenRecorder
+
+    @property
+    def share(self) -> float:
+        """Share of the trees with a diameter."""
+        import numpy as np
+
+        return float(np.isfinite(self.trees.dbh).mean())
+
+
+def _stand(seed: int) -> tuple[tuple[Cell, ...], tuple[float, float, float]]:
+    """One stand: its row, and the shares of trees with a diameter after the three drives."""
+    import numpy as np
+
+    from app.extensions.stand.detour import shortest_detour
+    from pipeline.config import preset
+    from pipeline.simulation.run import open_run
+    from pipeline.simulation.scenarios import parse_uri
+
+    first = open_run(parse_uri(f"sim:wild?seed={seed}"))
+    mapped, parameters = _map(first), preset("forest")
+    assert mapped.trees.sides is not None
+    known = np.isfinite(mapped.trees.dbh).tolist()
+    found = shortest_detour(
+        np.array([mapped.path.x[-1], mapped.path.y[-1]]),
+        mapped.trees.position,
+        0.5 * np.nan_to_num(mapped.trees.dbh),
+        [
+            None if is_known else bits
+            for is_known, bits in zip(known, mapped.trees.sides.tolist(), strict=True)
+        ],
+        np.radians(parameters.tracking.dbh_arc_min),
+        mapped.seen.area(mapped.path),
+        parameters.obstacles.width,
+    )
+    if found is None:
+        return (seed, first.lidar.name, 0.0, 100.0 * mapped.share, *[None] * 3), (mapped.share,) * 3
+    on, way = (_map(_driven_on(first, corners, found.length)).share for corners in (None, found.points))
+    shares = mapped.share, on, way
+    percent = [100.0 * share for share in shares]
+    return (seed, first.lidar.name, found.length, *percent, percent[2] - percent[1]), shares
+
+
+def _driven_on(first: SimulatedRun, corners: Float | None, length: float) -> SimulatedRun:
+    """The same run with a longer drive: along a way, or, for None, along the course of the scenario.
+
+    Args:
+        first: The run.
+        corners: Corners of the way, shape (K, 2), the first one where the run ends [m].
+        length: Length that is driven in addition [m].
+    """
+    import numpy as np
+
+    from pipeline.simulation.robot_motion import drive_course, inertial_readings, lay_course, lay_on_terrain
+    from pipeline.simulation.run import INERTIAL, SHAKE, odometry_of, random_stream
+    from pipeline.simulation.terrain import WheelContact
+
+    request = first.request
+    scenario = request.scenario
+    done = first.motion.drive
+    done_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(done.x), np.diff(done.y)))])
+    total_m = float(np.interp(request.duration_s, done.t, done_m)) + length
+    course = lay_course(np.array(scenario.waypoints), scenario.closed)
+    if corners is not None:
+        at = np.append(np.arange(0.0, total_m - length - 0.5 * SPACING, SPACING), total_m - length)
+        begun = np.column_stack([np.interp(at, done_m, column) for column in (done.x, done.y)])
+        legs = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
+        on = np.linspace(0.0, legs[-1], max(2, round(legs[-1] / SPACING)) + 1)[1:]
+        way = np.column_stack([np.interp(on, legs, column) for column in corners.T])
+        course = lay_course(np.concatenate([begun, way]), closed=False)
+        c, s = np.cos(course.heading), np.sin(course.heading)  # back into the frame of the scene
+        course = replace(
+            course,
+            x=c * course.x - s * course.y,
+            y=s * course.x + c * course.y,
+            yaw=course.yaw + course.heading,
+        )
+    drive = drive_course(course, scenario.speed, request.duration_s + 10.0 * length / scenario.speed)
+    driven_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(drive.x), np.diff(drive.y)))])
+    end = int(np.searchsorted(driven_m, min(total_m, driven_m[-1] - 0.1)))
+    longer = replace(request, duration_s=float(drive.t[end]))
+    kept = slice(0, end + 101)  # half a second longer, as `drive_course`
+    drive = replace(drive, **{name: getattr(drive, name)[kept] for name in drive.__slots__})
+    motion = lay_on_terrain(drive, WheelContact(first.scene.terrain), random_stream(SHAKE, longer))
+    return replace(
+        first,
+        request=longer,
+        motion=motion,
+        odometry=odometry_of(motion, longer),
+        inertial=inertial_readings(motion, random_stream(INERTIAL, longer)),
+        scans=round(longer.duration_s * 1e9) // first.lidar.period_ns,
+    )
+
+
+def _map(run: SimulatedRun) -> _Mapped:
+    """Map a run, and record what its scans observed."""
+    from pipeline.config import preset
+    from pipeline.detection.free_space import clear_range
+    from pipeline.geometry.columns import rows_of
+    from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.mapper import Mapper
+    from pipeline.odometry.synchroniser import steps
+    from pipeline.seen_area import SeenRecorder, ViewSelection
+
+    source = SimulatedSource("sim:wild", run)
+    about = source.description
+    mapper = Mapper(preset("forest"), sensor=about.sensor, T_base_lidar=about.T_base_lidar, seed=0)
+    seen, views, frame = SeenRecorder(), ViewSelection(), None
+    for step in steps(source.records()):
+        frame = mapper.process(step)
+        if views.take(frame.estimate.T_map_base):
+            seen.add(frame.stamp_ns, clear_range(frame.raw, frame.filtered, frame.sensor_offset))
+    assert frame is not None
+    return _Mapped(mapper.path, rows_of(frame.trees, frame.trees.confirmed), seen)
