@@ -74,7 +74,8 @@ class Recorder:
             return f"not recording: {self.problem}"
         lost = sum(self.losses.values())
         missing = f", {lost:,} messages missing because the disk is too slow" if lost else ""
-        return f"recording {self.path.name}, {self._file.tell() / 1e6:.0f} MB{missing}"
+        word = "recorded" if self._closing.is_set() else "recording"
+        return f"{word} {self.path.name}, {self._file.tell() / 1e6:.0f} MB{missing}"
 
     def begin(self, channels: Sequence[Channel], header: Mapping[str, Any], robot: str) -> None:
         """Write the beginning of the file and start the thread. A second call, and one after `close`, does

@@ -430,7 +430,9 @@ class LiveSource:
         return 0 if self._reader is None else self._reader.offset_ns
 
     def _name(self) -> str:
-        """Return the name of the robot for people."""
+        """Return the name of the robot or sensor for people."""
+        if isinstance(self._address, VelodyneAddress):
+            return "the sensor"
         return f"robot {self.robot}" if self.robot else "the robot"
 
     def _watch_robot(self) -> None:

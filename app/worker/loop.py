@@ -283,6 +283,8 @@ class WorkerLoop:
             case protocol.Pause():
                 self._held = True
                 self._show(session.pause())
+            case protocol.EndRecording():
+                session.end_recording()
             case protocol.Advance(scans=scans):
                 self._held = True
                 self._show(session.advance(scans))

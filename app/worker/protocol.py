@@ -119,6 +119,10 @@ class Advance(msgspec.Struct, frozen=True, tag="advance"):
     scans: Annotated[int, Meta(ge=-MOST_SCANS, le=MOST_SCANS)] = 1
 
 
+class EndRecording(msgspec.Struct, frozen=True, tag="end_recording"):
+    """Finish the recording of a live run, which goes on."""
+
+
 class Seek(msgspec.Struct, frozen=True, tag="seek"):
     """Seek to a time [s since the first scan]; the map becomes that of this time."""
 
@@ -174,7 +178,7 @@ class WorkerBusyError(StemmapError):
     """The worker is being restarted or does not answer in time. The same command may succeed later."""
 
 
-Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open
+Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open | EndRecording
 
 
 class Opened(msgspec.Struct, frozen=True, tag="opened"):

@@ -611,7 +611,7 @@ class Synchroniser:
         """Add a warning and a doubt without sigmas if more than PAUSE_NS have passed since the last step."""
         seconds = 0.0 if self._stepped_ns is None else (stamp_ns - self._stepped_ns) * 1e-9
         if seconds * 1e9 > PAUSE_NS:
-            self._warn(f"no scan for {seconds:.0f} s: the pose is known only by the odometry")
+            self._warn(f"no scan for {seconds:.0f} s: no tree corrects the pose meanwhile")
             self._suspect(f"no scan for {seconds:.0f} s", (0.0, 0.0))
 
     def _bridge(self, stamp_ns: int) -> None:

@@ -141,6 +141,6 @@ def test_a_stored_layout_that_is_not_one_is_ignored(wide: Dashboard):
     for stored in ("{", '{"left": "wide", "top": 1e9}', "[]"):
         page.evaluate("stored => localStorage.setItem('stemmap.layout', stored)", stored)
         page.reload()
-        expect(page.locator("#trees")).to_be_visible()
+        expect(page.locator("section.map")).to_be_visible()
         assert box(page.locator("section.map"))["width"] >= 0.14 * WIDTH
     page.evaluate("localStorage.removeItem('stemmap.layout')")

@@ -162,8 +162,10 @@ def test_sliders_are_in_view_and_none_moves_while_one_is_dragged(
     page.set_viewport_size({"width": width, "height": height})
     page.locator("#panel-tune").evaluate("panel => panel.scrollTo(0, 0)")
     assert page.evaluate(IN_VIEW) >= least
-    plan = page.locator(".map").bounding_box()  # of use, or left out in favour of the scene
-    assert plan is None or plan["height"] > 0.15 * height
+    for part in (".map", ".scene"):  # what the sliders change is seen beside them
+        box = page.locator(part).bounding_box()
+        assert box is not None
+        assert box["width"] * box["height"] > 0.15 * width * height
     sliders = page.locator("#tune-rows input[type=range]:visible")
 
     def places() -> list[float]:

@@ -55,6 +55,10 @@ class _Pause(Body):
     type: Literal["pause"]
 
 
+class _EndRecording(Body):
+    type: Literal["end_recording"]
+
+
 class _Advance(Body):
     type: Literal["advance"]
     scans: Annotated[int, Field(ge=-MOST_SCANS, le=MOST_SCANS)] = 1
@@ -80,7 +84,9 @@ class _SetSpeed(Body):
         return factor
 
 
-_AnyCommand = Annotated[_Play | _Pause | _Advance | _Seek | _SetSpeed, Field(discriminator="type")]
+_AnyCommand = Annotated[
+    _Play | _Pause | _EndRecording | _Advance | _Seek | _SetSpeed, Field(discriminator="type")
+]
 
 
 class _LoopSpan(Body):
@@ -125,8 +131,8 @@ async def status(dashboard: Dash) -> Response:
 
 @router.post("/command")
 async def command(body: _AnyCommand, dashboard: Dash) -> Response:
-    """POST /api/command: play, pause, advance, seek or set the speed. The response is empty (202); the status
-    reports the result. 503 if the worker is being restarted."""
+    """POST /api/command: play, pause, advance, seek, set the speed, or end the recording of a live run. The
+    response is empty (202); the status reports the result. 503 if the worker is being restarted."""
     await dashboard.command(msgspec.convert(body.model_dump(), Command))
     return json_reply({}, 202)
 

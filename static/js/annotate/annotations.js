@@ -233,15 +233,16 @@ const updateVotes = throttled(async () => {
   news();
 }, VOTES_EVERY);
 
-// Answers whether the tree on the card is a tree, and goes on to the next one at once. While the card loads, nothing is
-// answered: the person has not seen that tree yet.
+// Answers whether the tree on the card is a tree, and goes on to the next one at once. While the card loads, or the answer before
+// is on its way, nothing is answered: the person has not seen that tree yet.
 export async function review(kind) {
   const tree = selectedTree();
   if (!tree) {
     draft.error = "Select a found tree first: click it on the map, or press S for the next one.";
     return news();
   }
-  if (draft.shown === tree.number) await answer(tree, kind);
+  if (draft.shown === tree.number && !answering.has(tree.number)) await answer(tree, kind);
+  else showNews(`The key did not count: tree ${tree.number} was still loading.`);
 }
 
 async function answer(tree, kind) {
@@ -287,6 +288,7 @@ export async function skip() {
   draft.error = "";
   if (!tree || reviewOf(tree) !== "open" || answering.has(tree.number)) await next();
   else if (draft.shown === tree.number) await answer(tree, SKIPPED);
+  else showNews(`The key did not count: tree ${tree.number} was still loading.`);
 }
 
 // Selects the most doubtful open tree other than the selected one; without one, the skipped tree that follows the selected one.

@@ -12,9 +12,9 @@ import { annotating, annotationOf, draft, following, measureDbh, reviewOf, typed
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
-const KEPT = 4; // stories that are loaded ahead or shown
+const KEPT = 4; // trees whose stories are loaded ahead or shown
 let shown = "", pictured = null; // version of the shown evidence; number of the tree of the camera picture
-const stories = new Map(); // promise of each story by its version
+const stories = new Map(); // of each subject the newest story: {index of the scan, promise}
 
 const evidence = () => byId("review-evidence");
 
@@ -26,30 +26,34 @@ export const card = (hint) => el("article", { id: "review", class: "review", "ar
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
-const versionOf = (number) => `${state.annotations?.run} ${number} ${state.map.index} ${state.parameters?.revision}`;
+const subjectOf = (number) => `${state.annotations?.run} ${number} ${state.parameters?.revision}`;
 
-function story(number) {
-  const version = versionOf(number);
-  if (!stories.has(version)) {
-    stories.set(version, get(`/api/story/tree/${number}`));
-    stories.get(version).catch(() => stories.delete(version));
+// The story of a tree at this scan, or, for `atAnyScan`, one that was loaded ahead while the run plays on.
+function story(number, atAnyScan = false) {
+  const subject = subjectOf(number), { index } = state.map;
+  let kept = stories.get(subject);
+  if (!kept || (!atAnyScan && kept.index !== index)) {
+    kept = { index, promise: get(`/api/story/tree/${number}`) };
+    stories.delete(subject);
+    stories.set(subject, kept);
+    kept.promise.catch(() => stories.get(subject) === kept && stories.delete(subject));
     for (const old of [...stories.keys()].slice(0, -KEPT)) stories.delete(old);
   }
-  return stories.get(version);
+  return kept;
 }
 
 const refresh = keepFresh(async () => {
   const tree = annotating() ? selectedTree() : null;
   if (!tree) return;
-  const { number } = tree, version = versionOf(number);
-  if (version === shown) return;
+  const { number } = tree, subject = subjectOf(number);
+  if (`${subject} ${state.map.index}` === shown) return;
   let points, votes = "", loaded = "";
   try {
-    const explanation = await story(number);
+    const kept = story(number, evidence().dataset.tree !== String(number)), explanation = await kept.promise;
     const [figures] = ofExtensions("treeEvidence", explanation);
     points = figures ?? gatheredFigure(explanation);
     if (!figures) votes = columnFigure(explanation.column, "Votes on the accumulated scans");
-    loaded = version;
+    loaded = `${subject} ${kept.index}`;
   } catch (error) {
     points = el("p", { class: "empty", text: capital(error.message) });
   }
@@ -60,7 +64,7 @@ const refresh = keepFresh(async () => {
   evidence().dataset.tree = String(number);
   fillCard();
   const ahead = following();
-  if (ahead) story(ahead.number).catch(() => undefined); // the card shows its error when it comes to it
+  if (ahead) story(ahead.number, true).promise.catch(() => undefined); // the card shows its error when it comes to it
 }, PAUSE);
 
 // The selection may have changed when a person leaves the field: its DBH belongs to the tree that the field shows.

@@ -87,8 +87,9 @@ export async function ask(uri) {
 function finish(message) {
   requested = asked = null;
   setText(byId("source-open"), "Open");
-  if (message) say(message);
-  else dialog.close();
+  if (message) return say(message);
+  byId("source-uri").value = "";
+  dialog.close();
 }
 
 function follow({ status }) {
@@ -114,7 +115,10 @@ export function startSources() {
     ask(choice()?.address(path()) ?? path());
   });
   const field = byId("source-uri");
-  field.addEventListener("input", show);
+  field.addEventListener("input", () => {
+    say("");
+    show();
+  });
   field.addEventListener("keydown", (event) => { // completes the path, as in a terminal
     const wanted = completion();
     if (event.key !== "Tab" || event.shiftKey || !wanted) return;

@@ -71,7 +71,7 @@ export function sift() {
   const none = byId("source-none");
   if (!none) return;
   none.hidden = !words.length || entries.some(({ node }) => !node.hidden);
-  setText(none, "Nothing listed here has these words. Press Open for a path or an address of your own.");
+  setText(none, "Not in this list. Open takes any path or address.");
 }
 
 // The first address that begins with what is typed, else the only one that is shown; null if there is none or it is typed

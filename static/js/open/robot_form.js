@@ -3,17 +3,17 @@
 import { byId, el, recall, remember } from "../core/dom.js";
 
 const LIVE = /^(zenoh|velodyne|dds):/i;
-// For each kind: title, fields [name, title, placeholder], and the address of their values; "" if one is missing.
+// For each kind: title, fields [name, title, value without another one], and the address of their values.
 const KINDS = {
   zenoh: {
     title: "ROS 2 robot through a Zenoh router",
-    fields: [["host", "Address of the router", "192.168.1.5"], ["port", "Port", "7447"], ["robot", "Robot (its namespace)", "the first that sends scans"], ["domain", "ROS domain", "0"]],
-    address: ({ host, port, robot, domain }) => host && `zenoh:tcp/${host}:${port || 7447}${options({ robot, domain })}`,
+    fields: [["host", "Address of the router", "127.0.0.1"], ["port", "Port", "7447"], ["robot", "Robot (its namespace)", "the first that sends scans"], ["domain", "ROS domain", "0"]],
+    address: ({ host, port, robot, domain }) => `zenoh:tcp/${host || "127.0.0.1"}:${port || 7447}${options({ robot, domain })}`,
   },
   velodyne: {
     title: "Velodyne sensor by UDP",
     fields: [["from", "Address of the sensor", "192.168.1.201"], ["port", "Port on this machine", "2368"]],
-    address: ({ from, port }) => from && `velodyne:0.0.0.0:${port || 2368}?from=${from}`,
+    address: ({ from, port }) => `velodyne:0.0.0.0:${port || 2368}?from=${from || "192.168.1.201"}`,
   },
 };
 
@@ -31,6 +31,7 @@ export const recordingOf = (address) => (LIVE.test(address) && byId("source-reco
 
 export function showRobot() {
   byId("source-robot").open = true;
+  write();
   fields().querySelector("input").focus();
 }
 
@@ -58,5 +59,8 @@ export function startRobotForm() {
   record.addEventListener("change", () => remember("record", record.checked ? "yes" : "no"));
   const show = () => { byId("source-recorded").hidden = !LIVE.test(uri()) && !byId("source-robot").open; };
   byId("source-uri").addEventListener("input", show);
-  byId("source-robot").addEventListener("toggle", show);
+  byId("source-robot").addEventListener("toggle", ({ target }) => {
+    if (target.open && !uri()) write();
+    show();
+  });
 }

@@ -90,4 +90,10 @@ const use = ({ read_as: as, why, why_not: whyNot }) => (as ? `used as ${as}${why
 export function startInside() {
   byId("source-inside").addEventListener("toggle", look);
   byId("source-uri").addEventListener("change", look);
+  byId("source-uri").addEventListener("input", () => { // what is shown is of another source
+    if (looked && looked.uri !== uri()) {
+      looked = null;
+      body().replaceChildren();
+    }
+  });
 }

@@ -5,9 +5,9 @@ import { startPopover } from "../core/popover.js";
 import { on } from "../core/store.js";
 import { openTab, visible } from "./tabs.js";
 
-// left: width of the left part, top: height of the upper right part, upper: the same while the tab Tune is open, all in percent;
-// exchanged: the scene is on the left.
-const STANDARD = { left: 62, top: 55, upper: 20, exchanged: true, map: true, tabs: true };
+// left: width of the left part, top: height of the upper right part; lower: height of the lower left part while the tab Tune has the
+// right one for its sliders, all in percent; exchanged: the scene is on the left.
+const STANDARD = { left: 62, top: 55, lower: 40, exchanged: true, map: true, tabs: true };
 const LARGE_MAP = { left: 45, exchanged: false };
 const BUILT_IN = {
   Monitor: STANDARD,
@@ -19,7 +19,6 @@ const TABS = { Monitor: "trees", Tune: "tune", Annotate: "annotate", Results: "s
 const LEAST = 15, MOST = 80; // [%]
 const STEP = 2; // [%] by an arrow key
 const LONGEST_NAME = 40, MOST_SAVED = 20;
-const low = matchMedia("(max-height: 799px)");
 const work = document.querySelector(".work");
 let layout = { ...STANDARD };
 let saved = {};
@@ -39,13 +38,14 @@ function setLayout(changes) {
   layout = { ...layout, ...changes };
   layout.left = clipped(layout.left);
   layout.top = clipped(layout.top);
-  layout.upper = clipped(layout.upper);
+  layout.lower = clipped(layout.lower);
   remember("layout", JSON.stringify(layout));
   show();
 }
 
-// The height of the upper part that counts now.
-const height = () => (visible("tune") ? "upper" : "top");
+const isTuning = () => visible("tune") && layout.map && layout.tabs;
+// The height that the horizontal splitter changes now.
+const height = () => (isTuning() ? "lower" : "top");
 
 export const exchange = () => setLayout({ ...(layout.exchanged ? LARGE_MAP : { left: STANDARD.left, exchanged: true }), map: true });
 export const toggleMap = () => setLayout({ map: !layout.map });
@@ -59,12 +59,12 @@ export function useLayout(name) {
 
 function show() {
   work.style.setProperty("--left", `${layout.left}%`);
-  work.style.setProperty("--top", `${layout[height()]}%`);
+  work.style.setProperty("--top", `${layout.top}%`);
+  work.style.setProperty("--lower", `${layout.lower}%`);
   work.classList.toggle("exchanged", layout.exchanged && layout.map);
   work.classList.toggle("no-map", !layout.map);
   work.classList.toggle("no-tabs", !layout.tabs);
-  // In a low window, sliders would leave the map a strip: the scene alone shows what they do.
-  work.classList.toggle("no-upper", low.matches && visible("tune") && layout.exchanged && layout.map && layout.tabs && layout.upper === STANDARD.upper);
+  work.classList.toggle("tuning", isTuning()); // the map below the scene, the sliders beside both
   for (const [id, value] of [["split-left", layout.left], ["split-top", layout[height()]]]) byId(id).setAttribute("aria-valuenow", String(Math.round(value)));
   byId("map-exchange").setAttribute("aria-pressed", String(layout.exchanged));
   byId("layout-map").checked = layout.map;
@@ -114,7 +114,7 @@ function startSplitter(id, side, keys, percentAt) {
     if (!step || event.shiftKey) return;
     event.preventDefault();
     event.stopPropagation(); // the arrows would also step the run
-    setLayout({ [side()]: layout[side()] + step * STEP });
+    setLayout({ [side()]: layout[side()] + (side() === "lower" ? -step : step) * STEP });
   });
 }
 
@@ -135,9 +135,8 @@ export function startLayout() {
   startPopover(byId("layout-button"), byId("layout-menu"));
   byId("map-exchange").addEventListener("click", exchange);
   startSplitter("split-left", () => "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
-  startSplitter("split-top", height, { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (event.clientY - box.top)) / box.height);
+  startSplitter("split-top", height, { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (isTuning() ? box.bottom - event.clientY : event.clientY - box.top)) / box.height);
   on("tab", show);
-  low.addEventListener("change", show);
   saved = stored("layouts");
   setLayout(stored("layout"));
 }

@@ -1,9 +1,11 @@
 // The status strip and the notice below it.
 
 import { reviewOf, reviewProgress } from "../annotate/annotations.js";
+import { command } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital, figure, NONE } from "../core/format.js";
-import { refusedText } from "../core/permissions.js";
+import { edits, looksOnly, refusedText } from "../core/permissions.js";
+import { attempted, showNews } from "../core/problem.js";
 import { changed, isDrive, on, state, trees } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 import { isGoing } from "../playback/timeline.js";
@@ -149,16 +151,30 @@ function showState() {
   setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.refused ? "No access" : state.lostAt ? "No connection" : "Connecting");
   box.title = robotsTitle(state.status);
   const recording = state.status?.recording ?? "";
-  byId("recording").hidden = !recording;
-  byId("recording").classList.toggle("bad", recording.startsWith("not"));
-  setText(byId("recording"), `${recording.startsWith("not") ? "⚠" : "●"} ${recording.split(",")[0].split(":")[0]}`);
-  byId("recording").title = recording;
+  showRecording(state.status?.recording ?? "");
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
   const quiet = isOld();
   byId("figures").classList.toggle("old", quiet);
   showNotice(quiet);
   showWay();
 }
+
+// The file and its size, or why there is none; a press on a recording ends it.
+function showRecording(recording) {
+  const box = byId("recording"), isOn = recording.startsWith("recording");
+  box.hidden = !recording;
+  box.disabled = !isOn || looksOnly();
+  box.classList.toggle("bad", recording.startsWith("not"));
+  const [word] = recording.split(/[ :]/), size = recording.split(", ").find((part) => part.endsWith(" MB")) ?? "";
+  setText(box, recording.startsWith("not") ? `⚠ ${recording.split(":")[0]}` : `${isOn ? "●" : "■"} ${word} ${size}`);
+  box.title = isOn ? `${recording}; press to end the recording, while the run goes on` : recording;
+}
+
+export const isRecording = () => (state.status?.recording ?? "").startsWith("recording");
+export const endRecording = edits(() => attempted(async () => {
+  await command("end_recording");
+  showNews("The recording is finished. The run goes on.");
+}));
 
 // Whether a run plays and no message came for a while.
 function isOld() {
@@ -237,6 +253,7 @@ function showNotice(quiet) {
 const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 
 export function startStatus() {
+  byId("recording").addEventListener("click", endRecording);
   build();
   on("status map evaluation annotations", show);
   on("status map", showWay);
