@@ -20,6 +20,8 @@ INTO = 0.5
 SPACING, TURN = 0.5, math.radians(10.0)
 # Gaps of a cloud up to this width [m] count as covered, such as the shadow of a stem near a scanner.
 GAP = 1.0
+# Rows of views that are grouped at once: their arrays take about 100 MB, while a view has 11,000 rows.
+ROWS_MOST = 1_000_000
 MOST_VIEWS = 4  # of one place; twice the views that a cell needs in a plot by default
 
 
@@ -187,8 +189,10 @@ class SeenRecorder:
         """
         from pipeline.detection.free_space import directions  # the web process starts without Numba
 
+        area = SeenArea(CELL, np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0, np.int64))
         cells: list[Int] = []
         distance: list[Float] = []
+        rows = 0
         half = math.ceil(RANGE / CELL) + 1
         side = np.arange(-half, half + 1)
         grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -206,7 +210,17 @@ class SeenRecorder:
             seen = (reach <= free[directions(points, np.zeros(3))] + INTO) & (reach <= RANGE)
             cells.append(place[seen])
             distance.append(reach[seen])
-        if not cells:
-            return SeenArea(CELL, np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0, np.int64))
-        place, nearest = np.concatenate(cells), np.concatenate(distance)
-        return SeenArea(CELL, *_grouped(place, nearest, np.ones(len(place), np.int64), np.add))
+            rows += len(cells[-1])
+            if rows >= ROWS_MOST:
+                area = _with_views(area, cells, distance)
+                cells, distance, rows = [], [], 0
+        return _with_views(area, cells, distance)
+
+
+def _with_views(area: SeenArea, cells: list[Int], distance: list[Float]) -> SeenArea:
+    """Return an area with further views: the cells of each, shape (K, 2), and their distances, shape (K,)
+    [m]."""
+    if not cells:
+        return area
+    place, nearest = np.concatenate(cells), np.concatenate(distance)
+    return area.joined(SeenArea(CELL, place, nearest, np.ones(len(place), np.int64)))

@@ -131,19 +131,24 @@ class ShownRun:
         return text if self.one_step is None else csv_in_units(text, self.one_step.crs_unit)
 
     @contextmanager
-    def folder(self) -> Iterator[FilePath]:
+    def folder(self, *, with_seen: bool = True) -> Iterator[FilePath]:
         """Write the run to a temporary folder, as `stemmap map` does, with the reference system that a user
         gave the map, and yield it; it is removed afterwards. Raises StemmapError if a file cannot be written,
-        and OSError without a place for the folder."""
+        and OSError without a place for the folder.
+
+        Args:
+            with_seen: Whether to write seen.csv, which takes milliseconds for each view of a drive.
+        """
         with TemporaryDirectory(prefix="stemmap-run-") as name:
-            write_texts(FilePath(name), self.texts())
+            write_texts(FilePath(name), self.texts(with_seen=with_seen))
             if self.frame is not None and self.frame.content.values is not None:
                 write_map_frame(FilePath(name), self.frame.content.values["frame"])
             yield FilePath(name)
 
-    def texts(self) -> dict[str, str]:
-        """Return a dict from the names trees.csv, path.csv, seen.csv, terrain.csv and run.json to the texts
-        of these files. terrain.csv has only its header if the newest results have no ground."""
+    def texts(self, *, with_seen: bool = True) -> dict[str, str]:
+        """Return a dict from the names trees.csv, path.csv, seen.csv (only if `with_seen`), terrain.csv and
+        run.json to the texts of these files. terrain.csv has only its header if the newest results have no
+        ground."""
         ground, offset = self.shown.frame.ground, self.offset
         cells = [] if ground is None else list(terrain_rows(ground))
         if self.one_step is not None:
@@ -154,7 +159,7 @@ class ShownRun:
         return {
             "trees.csv": self.trees_text(),
             "path.csv": csv_text(PATH_COLUMNS, path_rows(self.path, self.start_ns)),
-            "seen.csv": self._in_units(seen_text(self._seen_area())),
+            **({"seen.csv": self._in_units(seen_text(self._seen_area()))} if with_seen else {}),
             "terrain.csv": self._in_units(csv_text(TERRAIN_COLUMNS, cells)),
             "run.json": json.dumps(self._record(), indent=1) + "\n",
         }

@@ -151,7 +151,7 @@ async def exported_layer(
     kind of question if neither the question nor the files of the run have changed, because programs ask every
     few seconds and a child needs 1.6 s of CPU time. 422 if the child reports an error or takes too long."""
     with as_bad_request():
-        async with dashboard.exporting, in_thread(run.folder()) as folder:
+        async with dashboard.exporting, in_thread(run.folder(with_seen=False)) as folder:
             name = f"{question['ask']} {question.get('layer', '')}"
             key = await asyncio.to_thread(_digest, question, folder)
             if dashboard.layers.get(name, ("", b""))[0] != key:

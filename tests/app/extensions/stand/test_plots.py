@@ -131,6 +131,20 @@ def test_the_observed_area_moves_with_the_final_path():
     assert len(SeenRecorder().area(path_of([[0, 0, 0]])).place) == 0
 
 
+def test_the_observed_area_does_not_depend_on_how_many_views_are_grouped_at_once(monkeypatch):
+    rng = np.random.default_rng(3)
+    recorder, poses = SeenRecorder(), rng.uniform(-20.0, 20.0, (12, 3))
+    for k in range(len(poses)):
+        recorder.add(k * 10**9, rng.uniform(1.0, 12.0, BINS))
+    at_once = recorder.area(path_of(poses))
+    monkeypatch.setattr("pipeline.seen_area.ROWS_MOST", 1000)
+    in_parts = recorder.area(path_of(poses))
+    np.testing.assert_array_equal(in_parts.place, at_once.place)
+    np.testing.assert_array_equal(in_parts.nearest, at_once.nearest)
+    np.testing.assert_array_equal(in_parts.views, at_once.views)
+    assert at_once.views.max() > 2
+
+
 def test_views_are_recorded_after_a_motion_and_a_few_times_at_one_place():
     views = ViewSelection()
     assert views.take(Pose2())
