@@ -2,9 +2,11 @@
 the stems contradict.
 
 The robot is mapped apart from the stored map, in the frame `odom`: that of its own map or odometry. While it
-is not found, the stems of the last metres are searched in the stored map (`search`). A fix gives T_map_odom,
-which is fitted again to the nearby stems whenever the robot has moved. The fix is withdrawn if the stems of
-the last metres show another place.
+is not found, the stems of the last metres are searched in the stored map (`search`). A fix gives T_map_odom.
+It is followed as in a Kalman filter: the drift since the last alignment makes it uncertain, and the stems in
+view, paired within that uncertainty, correct it. A few stems that agree by chance elsewhere therefore cannot
+move it. While the stems in view speak rather against the place, no pose is given; it is withdrawn when their
+odds decide.
 
 The stored map is never changed.
 """
@@ -21,9 +23,10 @@ from scipy.stats import binom
 
 from pipeline.geometry.poses import Float, Pose2, Pose3
 from pipeline.localisation.heights import HeightFix, align_heights
-from pipeline.localisation.search import SIGMA_XY, MapFix, MapIndex, false_alarms, fix_near, search_map
+from pipeline.localisation.search import SIGMA_XY, MapFix, MapIndex, Prior, false_alarms, fix_near, search_map
 from pipeline.localisation.stored_map import StoredMap
 from pipeline.loop_closure.stem_matching import MapStems, Match, worst_sigma
+from pipeline.slam.frame_uncertainty import transported_covariance
 from pipeline.slam.places import AGREEING, ODDS
 from pipeline.types.records import Bool, Detections, Int, Trees
 
@@ -127,7 +130,10 @@ class Localiser:
         self._pose = Pose2()
         self._view: Detections | None = None
         self._fix: MapFix | None = None
-        self._fixed_at = self._next = 0.0
+        self._followed = Pose2()  # T_map_odom, while there is a fix
+        self._covariance: Float = np.zeros((3, 3))  # of x, y, yaw of the base in the map at _place
+        self._place, self._fixed_at, self._odds = np.zeros(2), 0.0, 0.0
+        self._next = 0.0
         self._searched_stems = self._first = 0
 
     def update(
@@ -158,10 +164,10 @@ class Localiser:
         self.localisation = replace(self.localisation, driven=driven)
         if self._index is None:
             return self.localisation
-        if self.localisation.T_map_odom is None:
+        if self._fix is None:
             self._search(self._index, trees, terrain)
         elif driven >= self._next:
-            self._track(self._index, self.localisation.T_map_odom, trees, terrain)
+            self._track(self._index, trees, terrain)
         return self.localisation
 
     @property
@@ -208,29 +214,41 @@ class Localiser:
         state = State.ABSENT if absent else State.SEARCHING
         self.localisation = replace(self.localisation, state=state, searches=k, reason=fix.reason or "")
 
-    def _track(self, index: MapIndex, T_map_odom: Pose2, trees: Trees, terrain: Float | None) -> None:
-        """Fit the pose again to the nearby stems; withdraw it if they contradict it."""
+    def _track(self, index: MapIndex, trees: Trees, terrain: Float | None) -> None:
+        """Correct the pose by the stems in view; withdraw it if they contradict it."""
         self._next = self._driven[-1] + TRACK_EVERY
-        fix = fix_near(T_map_odom, self._in_view(trees), index, self._slack)
-        if fix.inside < FEWEST:  # outside of the map
-            self._drift()
-            return
-        agreeing = len(fix.local) >= AGREEING * fix.inside  # as for a new fix
-        if not agreeing or _log_odds(len(fix.local), fix.inside, fix.chance) < -ODDS:
+        prior, base = self._prior(), self._followed @ self._pose
+        fix = fix_near(self._followed, self._in_view(trees), index, self._slack, Prior(base, prior))
+        odds = _log_odds(len(fix.local), fix.inside, fix.chance) if fix.inside >= FEWEST else 0.0
+        self._odds = odds if odds > ODDS else self._odds + odds
+        if self._odds < -ODDS:
             self._first = len(self._stamp_ns) - 1  # what was seen before is in another place of the local map
             self._search_again("contradicted", withdrawn=self.localisation.withdrawn + 1)
-            return
-        if fix.pose is not None and len(fix.local) >= FEWEST:
+        elif odds < 0.0:
+            self.localisation = replace(
+                self.localisation, state=State.SEARCHING, T_map_odom=None, covariance=np.zeros((3, 3)),
+                stems=len(fix.local), of=fix.inside, reason="the stems in view disagree",
+            )  # fmt: skip
+        elif fix.pose is not None and odds > 0.0:
             self._use(fix, fix.pose, terrain, is_new=False)
         else:
-            self._drift()
+            self._drift(prior)
+
+    def _prior(self) -> Float:
+        """Return the covariance of the base in the map by the last alignment and the drift since then."""
+        place = self._followed.apply(np.array([[self._pose.x, self._pose.y]]))[0]
+        dx, dy = place - self._place
+        way = self._driven[-1] - self._fixed_at
+        drift = np.diag([DRIFT_XY**2 * way, DRIFT_XY**2 * way, DRIFT_YAW**2 * way])
+        return transported_covariance(self._covariance, float(dx), float(dy)) + drift
 
     def _use(self, fix: MapFix, pose: Pose2, terrain: Float | None, *, is_new: bool) -> None:
         """Take over a fix with its pose: new, or an alignment of the present one."""
-        place = np.array([self._pose.x, self._pose.y])
-        self._fix, self._fixed_at = fix, self._driven[-1]
+        self._fix, self._followed, self._fixed_at = fix, pose, self._driven[-1]
         self._next = self._driven[-1] + TRACK_EVERY
-        at = pose.apply(place[None])[0]
+        odom = np.array([self._pose.x, self._pose.y])
+        self._place = at = pose.apply(odom[None])[0]
+        self._covariance = fix.covariance_at(odom)
         height = (
             None
             if terrain is None
@@ -240,7 +258,7 @@ class Localiser:
             self.localisation,
             state=State.FOUND,
             T_map_odom=pose,
-            covariance=fix.covariance_at(place) + self._shared,
+            covariance=self._covariance + self._shared,
             stems=len(fix.local),
             of=max(fix.inside, len(fix.local)),
             residual=fix.residual,
@@ -248,21 +266,18 @@ class Localiser:
             found_at=self._driven[-1] if is_new else self.localisation.found_at,
             reason="",
         )
+        if is_new:
+            self._odds = 0.0
 
-    def _drift(self) -> None:
-        """Enlarge the covariance of the last fix by the drift since then; search again if the place is too
-        uncertain for a fix."""
-        if self._fix is None:
-            return
-        way = self._driven[-1] - self._fixed_at
-        added = np.diag([DRIFT_XY**2 * way, DRIFT_XY**2 * way, DRIFT_YAW**2 * way])
-        place = np.array([self._pose.x, self._pose.y])
-        grown = replace(self._fix, covariance=self._fix.covariance + added)
-        covariance = grown.covariance_at(place) + self._shared
+    def _drift(self, covariance: Float) -> None:
+        """Keep the pose with the covariance of `_prior`; search again if it is too uncertain for a fix."""
         if max(np.sqrt(np.diag(covariance)[:2])) > SIGMA_XY:
             self._search_again("outside of the map", withdrawn=self.localisation.withdrawn)
             return
-        self.localisation = replace(self.localisation, covariance=covariance, stems=0, of=0)
+        self.localisation = replace(
+            self.localisation, state=State.FOUND, T_map_odom=self._followed, reason="",
+            covariance=covariance + self._shared, stems=0, of=0,
+        )  # fmt: skip
 
     @property
     def _shared(self) -> Float:

@@ -370,7 +370,9 @@ def _decided(fix: MapFix, n: int, level: float) -> MapFix:
     return replace(fix, reason=reason)
 
 
-def refine(pose: Float, local: MapStems, index: MapIndex, slack: float) -> tuple[Float, Int]:
+def refine(
+    pose: Float, local: MapStems, index: MapIndex, slack: float, prior: Float | None = None
+) -> tuple[Float, Int]:
     """Return a pose x, y [m], yaw [rad] after pairing and alignment in turns, and the row of the map of each
     local stem, -1 for none, int64, shape (L,).
 
@@ -379,31 +381,87 @@ def refine(pose: Float, local: MapStems, index: MapIndex, slack: float) -> tuple
         local: Local stems, about their mean.
         index: The map.
         slack: See `MapIndex.of`.
+        prior: Covariance of `pose`, shape (3, 3), which then takes part in the alignment; None if it is only
+            an initial value.
     """
     of, before = np.full(len(local), -1, np.int64), np.full(len(local), -2, np.int64)
+    wide = WIDE * slack if prior is None else math.sqrt(slack**2 + float(prior[0, 0] + prior[1, 1]))
+    initial = pose
     for k in range(ROUNDS):
-        wide = slack * (WIDE if k < WIDE_ROUNDS else 1.0)
-        found = partners(pose, *_columns(local), *_columns(index.stems), *index.grid, wide, REACH, of)
-        if found < 2 or (k > WIDE_ROUNDS and np.array_equal(of, before)):
+        gate = wide if k < WIDE_ROUNDS else slack
+        found = partners(pose, *_columns(local), *_columns(index.stems), *index.grid, gate, REACH, of)
+        if found < (2 if prior is None else 1) or (k > WIDE_ROUNDS and np.array_equal(of, before)):
             break
         at = np.flatnonzero(of >= 0)
         weight = 1.0 / (local.sigma[at] ** 2 + index.stems.sigma[of[at]] ** 2 + slack**2)
-        pose = aligned(local.position[at], index.stems.position[of[at]], weight)
+        to = index.stems.position[of[at]]
+        if prior is None:
+            pose = aligned(local.position[at], to, weight)
+        else:
+            pose = corrected(initial, prior, local.position[at], to, weight)[0]
         before = of.copy()
     return pose, of
 
 
-def fix_near(T_map_local: Pose2, local: MapStems, index: MapIndex, slack: float) -> MapFix:
+def corrected(
+    pose: Float, covariance: Float, local: Float, reference: Float, weight: Float
+) -> tuple[Float, Float]:
+    """Return a pose x, y [m], yaw [rad], shape (3,), corrected by pairs of stems, and its covariance: one
+    step of Gauss-Newton from it with its covariance as a prior. The information of the pairs is divided by
+    chi^2 per degree of freedom of their residuals if that is above 1.
+
+    Args:
+        pose, covariance: The pose before, shapes (3,) and (3, 3); within a few degrees.
+        local, reference: Pairs, shape (M, 2) [m].
+        weight: Weights of the pairs, shape (M,) [1/m^2].
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    arm = local @ np.array([[c, s], [-s, c]])
+    residual = reference - arm - pose[:2]
+    J = np.zeros((len(arm), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2], J[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    H, g = np.einsum("nki,nkj,n->ij", J, J, weight), np.einsum("nki,nk,n->i", J, residual, weight)
+    before = np.linalg.inv(covariance)
+    left = residual - J @ np.linalg.solve(H + before, g)
+    scale = max(float(weight @ np.sum(left**2, axis=1)) / max(2 * len(arm) - 3, 1), 1.0)
+    after = np.linalg.inv(H / scale + before)
+    return pose + after @ g / scale, 0.5 * (after + after.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Pose of the base in the map as it is known before an alignment: T_map_base and the covariance of x, y
+    [m], yaw [rad], shape (3, 3)."""
+
+    T_map_base: Pose2
+    covariance: Float
+
+
+def fix_near(
+    T_map_local: Pose2, local: MapStems, index: MapIndex, slack: float, prior: Prior | None = None
+) -> MapFix:
     """Return the pose that fits best near a known one; its reason is None if it is determined, and its
-    agreement is not tested. Arguments as in `search_map`."""
+    agreement is not tested. With a prior, that is the most probable pose, and any number of stems determines
+    it. The other arguments are those of `search_map`."""
     local = relative(local)
     if not len(local):
         return _none("too few stems")
     mean = local.position.mean(axis=0)
     centred = MapStems(local.position - mean, local.sigma, local.dbh, local.dbh_sigma)
     there = T_map_local @ Pose2(float(mean[0]), float(mean[1]), 0.0)
-    pose, of = refine(there.as_array(), centred, index, slack)
-    if np.count_nonzero(of >= 0) >= 3:
+    known = None
+    if prior is not None:
+        dx, dy = there.x - prior.T_map_base.x, there.y - prior.T_map_base.y
+        known = transported_covariance(prior.covariance, dx, dy)
+    pose, of = refine(there.as_array(), centred, index, slack, known)
+    at = np.flatnonzero(of >= 0)
+    if known is not None and len(at):
+        weight = 1.0 / (centred.sigma[at] ** 2 + index.stems.sigma[of[at]] ** 2 + slack**2)
+        to = index.stems.position[of[at]]
+        pose, covariance = corrected(there.as_array(), known, centred.position[at], to, weight)
+        return _fix(pose, of, centred, mean, index, slack, covariance=covariance)
+    if len(at) >= 3:
         return _fix(pose, of, centred, mean, index, slack)
     density, inside = crowding(there.as_array(), centred.position, index.stems.position, WINDOW)
     return _none("no agreement", inside=inside, chance=_chance(density, centred, index, slack))
@@ -411,18 +469,22 @@ def fix_near(T_map_local: Pose2, local: MapStems, index: MapIndex, slack: float)
 
 def _fix(
     pose: Float, of: Int, centred: MapStems, mean: Float, index: MapIndex, slack: float,
-    *, second: int = 0, looked: int = 0,
+    *, second: int = 0, looked: int = 0, covariance: Float | None = None,
 ) -> MapFix:  # fmt: skip
-    """Return a refined pose of the stems about their mean as a fix, without a decision."""
+    """Return a refined pose of the stems about their mean as a fix, without a decision. Its covariance is
+    that of the alignment if it is not given."""
     at = np.flatnonzero(of >= 0)
     to, reference = of[at], index.stems
     about_mean = Pose2(*(float(v) for v in pose))
     T_map_local = about_mean @ Pose2(-float(mean[0]), -float(mean[1]))
-    variance = centred.sigma[at] ** 2 + reference.sigma[to] ** 2 + slack**2
-    try:
-        covariance = alignment_covariance(about_mean, centred.position[at], reference.position[to], variance)
-    except np.linalg.LinAlgError:
-        covariance = np.diag([1e6, 1e6, 1e6])
+    if covariance is None:
+        variance = centred.sigma[at] ** 2 + reference.sigma[to] ** 2 + slack**2
+        try:
+            covariance = alignment_covariance(
+                about_mean, centred.position[at], reference.position[to], variance
+            )
+        except np.linalg.LinAlgError:
+            covariance = np.diag([1e6, 1e6, 1e6])
     density, inside = crowding(pose, centred.position, reference.position, WINDOW)
     residual = reference.position[to] - about_mean.apply(centred.position[at])
     return MapFix(
@@ -443,4 +505,4 @@ def _columns(stems: MapStems) -> tuple[Float, Float, Float, Float]:
     return stems.position, stems.sigma, stems.dbh, stems.dbh_sigma
 
 
-__all__ = ["MapFix", "MapIndex", "Refusal", "fix_near", "search_map"]
+__all__ = ["MapFix", "MapIndex", "Prior", "Refusal", "fix_near", "search_map"]
