@@ -1,9 +1,11 @@
 """Global search of a local constellation of stems in a stored map: the best pose and its chance of being
 false.
 
-A pair of local stems is aligned with each pair of the map of equal length. An alignment is compared with an
-occupancy raster of the stems of the map, first near the pair, and dropped by a sequential test (Wald 1945) as
-soon as its stems agree so rarely that it is not the right one. The best alignments are refined with exact
+A pair of local stems is aligned with each pair of the map of equal length. Each pair of the map has a mask of
+the stems around it, in its own frame, of 576 bits; the number of local stems that agree is that of the common
+bits, and most wrong alignments are dropped by it in a nanosecond. The others are compared with an occupancy
+raster of the stems of the map, first near the pair, and dropped by a sequential test (Wald 1945) as soon as
+their stems agree so rarely that they are not the right one. The best alignments are refined with exact
 positions (`stem_matching.partners`), as in `find_constellation`.
 
 The fix is accepted if its agreement is not chance: the number M of alignments that were tried, times the
@@ -23,6 +25,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import betaincinv
 from scipy.stats import binom
 
@@ -62,6 +65,9 @@ SPACING = 2.0, 8.0  # m; bounds of the mean distance of stems
 BASE_PAIRS = 24
 FURTHER_PAIRS = 6  # base pairs after the first that finds a pose beyond chance; they find its rivals too
 MOST_PAIRS = 2_000_000  # pairs of the map
+# Cells of a mask along each axis, and their side in mean distances of the stems: it has about 23 stems. Cells
+# within MASK_NEAR [m] of a stem are set, 2 sigma of two maps: with more, half of the wrong alignments pass.
+MASK, MASK_CELL, MASK_NEAR = 24, 0.2, 0.2
 RASTER = 0.25  # m; cell of the occupancy raster
 NEAR = 0.4  # m; a stem agrees with an alignment of a pair within it: 3 sigma of two maps
 MOST_CELLS = 1 << 28  # of the raster, one bit each; larger maps get larger cells
@@ -82,8 +88,10 @@ class MapIndex:
     """A stored map prepared for searches.
 
     Attributes:
-        stems: The stems.
+        stems, tree: The stems, and the tree of their positions.
         pair, length: Pairs of stems by length, see `pairs_within`.
+        mask, mask_cell, mask_chance: Mask of each pair, uint64, shape (K, MASK^2 / 64), see `mask_pairs`;
+            side of its cells [m]; share of the bits that are set.
         grid: Grid of the stems, see `cells_of`.
         low, cell, near: Low corner [m], cell [m] and blocks of 8 x 8 cells of the raster, uint64, shape (W,
             H): bit 8 i + j is set if cell i, j of the block is within NEAR of a stem.
@@ -92,8 +100,12 @@ class MapIndex:
     """
 
     stems: MapStems
+    tree: cKDTree
     pair: Int32
     length: Float
+    mask: Blocks
+    mask_cell: float
+    mask_chance: float
     grid: tuple[Float, Int32, Int32]
     low: Float
     cell: float
@@ -111,7 +123,8 @@ class MapIndex:
         """
         stems = relative(stored.stems)
         position = stems.position
-        density, _ = crowding(np.zeros(3), position, position, WINDOW)
+        tree = cKDTree(position)
+        density, _ = crowding(np.zeros(3), position, tree, WINDOW)
         spacing = min(max(1.0 / math.sqrt(density), SPACING[0]), SPACING[1])
         reach = SHORTEST * spacing, LONGEST * spacing
         margin = 2.0 * math.sqrt(4.0 * SIGMA**2 + 2.0 * slack**2)
@@ -123,7 +136,14 @@ class MapIndex:
         near = np.zeros((width, height), np.uint64)
         occupy(near, position, low, cell, NEAR)
         chance = min(1.0 - math.exp(-density * math.pi * NEAR**2), 0.5 * SEEN_AGAIN)
-        return cls(stems, pair, length, cells_of(position, REACH), low, cell, near, reach, chance)
+        side = MASK_CELL * spacing
+        mask = np.zeros((len(pair), MASK * MASK // 64), np.uint64)
+        bits = mask_pairs(position, *cells_of(position, (MASK + 1) * side), pair, side, MASK_NEAR, mask)
+        mask_chance = min(max(bits / max(mask.size * 64, 1), 1e-3), 0.5 * SEEN_AGAIN)
+        return cls(
+            stems, tree, pair, length, mask, side, mask_chance, cells_of(position, REACH), low, cell, near,
+            reach, chance,
+        )  # fmt: skip
 
 
 def relative(stems: MapStems) -> MapStems:
@@ -150,11 +170,69 @@ def occupy(near: Blocks, position: Float, low: Float, cell: float, reach: float)
 
 
 @compiled
+def mask_pairs(
+    position: Float, grid: Float, first: Int32, following: Int32, pair: Int32, side: float, reach: float,
+    mask: Blocks,
+) -> int:  # fmt: skip
+    """Fill the masks of the pairs of a map; return the number of bits that are set.
+
+    The frame of a pair has its origin in the middle, and its x axis points from the first stem to the second.
+    Bit MASK i + j of the mask is set if another stem is within `reach` of the cell from (i - MASK / 2) to
+    (i + 1 - MASK / 2) sides along x, and the same with j along y.
+
+    Args:
+        position: Stems, shape (N, 2) [m].
+        grid, first, following: Their grid, see `cells_of`, with cells of at least MASK / sqrt(2) sides.
+        pair: Rows of the pairs, int32, shape (K, 2).
+        side: Side of a cell [m].
+        reach: Uncertainty of a position [m].
+        mask: Filled, uint64, shape (K, MASK^2 / 64).
+    """
+    bits = 0
+    margin = reach / side
+    for k in range(pair.shape[0]):
+        a, b = pair[k, 0], pair[k, 1]
+        dx, dy = position[b, 0] - position[a, 0], position[b, 1] - position[a, 1]
+        scale = 1.0 / (np.sqrt(dx * dx + dy * dy) * side)
+        c, s = dx * scale, dy * scale
+        mx, my = 0.5 * (position[a, 0] + position[b, 0]), 0.5 * (position[a, 1] + position[b, 1])
+        ia, ib = int((mx - grid[0]) / grid[2]), int((my - grid[1]) / grid[2])
+        for ca in range(max(ia - 1, 0), min(ia + 2, first.shape[0])):
+            for cb in range(max(ib - 1, 0), min(ib + 2, first.shape[1])):
+                m = first[ca, cb]
+                while m >= 0:
+                    x, y = position[m, 0] - mx, position[m, 1] - my
+                    u, v = c * x + s * y + 0.5 * MASK, c * y - s * x + 0.5 * MASK
+                    if m != a and m != b and -margin < u < MASK + margin and -margin < v < MASK + margin:
+                        for i in range(max(int(u - margin), 0), min(int(u + margin) + 1, MASK)):
+                            ex = max(i - u, u - i - 1.0, 0.0)
+                            for j in range(max(int(v - margin), 0), min(int(v + margin) + 1, MASK)):
+                                ey = max(j - v, v - j - 1.0, 0.0)
+                                if ex * ex + ey * ey <= margin * margin:
+                                    at = MASK * i + j
+                                    mask[k, at >> 6] |= np.uint64(1) << np.uint64(at & 63)
+                    m = following[m]
+        for word in range(mask.shape[1]):
+            bits += ones(mask[k, word])
+    return bits
+
+
+@compiled
+def ones(word: np.uint64) -> int:
+    """Return the number of bits of a word that are set (Knuth 2009, 7.1.3, by sums of neighbours); compilers
+    know the form and use the instruction of the processor."""
+    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@compiled
 def align_pairs(
     local: Float, local_sigma: Float, local_dbh: Float, local_dbh_sigma: Float, base: Int32,
     reference: Float, sigma: Float, dbh: Float, dbh_sigma: Float, pair: Int32, length: Float,
-    low: Float, cell: float, near: Blocks,
-    slack: float, hit: float, miss: float, enough: int,
+    mask: Blocks, mask_cell: float, mask_chance: float, low: Float, cell: float, near: Blocks, chance: float,
+    slack: float, seen_again: float, enough: int,
 ) -> tuple[Float, Int, int]:  # fmt: skip
     """Align each base pair with all pairs of the map of equal length, and count the stems that agree.
 
@@ -162,9 +240,9 @@ def align_pairs(
         local, local_sigma, local_dbh, local_dbh_sigma: Columns of the local stems, see `MapStems`.
         base: Pairs of local rows, int32, shape (B, 2).
         reference, sigma, dbh, dbh_sigma: Columns of the stems of the map.
-        pair, length, low, cell, near: See `MapIndex`.
+        pair, length, mask, mask_cell, mask_chance, low, cell, near, chance: See `MapIndex`.
         slack: See `MapIndex.of`.
-        hit, miss: Change of the log likelihood ratio by a stem that agrees, and by one that does not.
+        seen_again: Share of the stems that agree with the right alignment.
         enough: Number of stems of the first alignment after which FURTHER_PAIRS base pairs follow.
 
     Returns:
@@ -173,6 +251,10 @@ def align_pairs(
     """
     pose, agree = np.empty((KEPT, 3)), np.zeros(KEPT, np.int64)
     kept, looked, floor = 0, 0, 2
+    # Changes of the log likelihood ratio by a stem that agrees, and by one that does not.
+    hit, miss = np.log(seen_again / chance), np.log((1.0 - chance) / (1.0 - seen_again))
+    masked = np.log(seen_again / mask_chance), np.log((1.0 - mask_chance) / (1.0 - seen_again))
+    ahead, back = np.empty(mask.shape[1], np.uint64), np.empty(mask.shape[1], np.uint64)
     count = min(local.shape[0], COUNTED + 2)
     px, py = np.empty(count), np.empty(count)
     worst = sigma.max()
@@ -190,23 +272,38 @@ def align_pairs(
         order = np.argsort(distance2, kind="mergesort")
         for m in range(count - 2):
             px[m], py[m] = local[order[m], 0] - mx, local[order[m], 1] - my
+        ahead[:] = back[:] = 0
+        for m in range(count - 2):
+            u = (bx * px[m] + by * py[m]) / (span * mask_cell) + 0.5 * MASK
+            v = (bx * py[m] - by * px[m]) / (span * mask_cell) + 0.5 * MASK
+            if 0.0 <= u < MASK and 0.0 <= v < MASK:
+                bit = MASK * int(u) + int(v)
+                ahead[bit >> 6] |= np.uint64(1) << np.uint64(bit & 63)
+                bit = MASK * MASK - 1 - bit
+                back[bit >> 6] |= np.uint64(1) << np.uint64(bit & 63)
+        inside = 0
+        for word in range(mask.shape[1]):
+            inside += ones(ahead[word])
+        least = inside * masked[1] / (masked[0] + masked[1])  # a likelihood ratio of 1
         variance = local_sigma[i] ** 2 + local_sigma[j] ** 2 + 2.0 * slack * slack
         widest = 2.0 * np.sqrt(variance + 2.0 * worst * worst)
-        at = np.searchsorted(length, span - widest)
-        while at < length.shape[0] and length[at] <= span + widest:
+        begin, end = np.searchsorted(length, span - widest), np.searchsorted(length, span + widest)
+        looked += 2 * (end - begin)
+        for at in range(begin, end):
             a, b = pair[at, 0], pair[at, 1]
             off = length[at] - span
-            at += 1
-            if off * off > 4.0 * (variance + sigma[a] ** 2 + sigma[b] ** 2):
-                continue
-            for _ in range(2):
-                a, b = b, a
+            for turned in range(2):
+                common = 0
+                for word in range(mask.shape[1]):
+                    common += ones(mask[at, word] & (back[word] if turned else ahead[word]))
+                if common < least or off * off > 4.0 * (variance + sigma[a] ** 2 + sigma[b] ** 2):
+                    continue
+                a, b = pair[at, turned], pair[at, 1 - turned]
                 if not (
                     alike(local_dbh[i], local_dbh_sigma[i], dbh[a], dbh_sigma[a])
                     and alike(local_dbh[j], local_dbh_sigma[j], dbh[b], dbh_sigma[b])
                 ):
                     continue
-                looked += 1
                 rx, ry = reference[b, 0] - reference[a, 0], reference[b, 1] - reference[a, 1]
                 scale = 1.0 / (span * np.sqrt(rx * rx + ry * ry))
                 c, s = (bx * rx + by * ry) * scale, (bx * ry - by * rx) * scale
@@ -328,14 +425,14 @@ def search_map(local: MapStems, index: MapIndex, slack: float, level: float) -> 
     mean = local.position.mean(axis=0)
     centred = MapStems(local.position - mean, local.sigma, local.dbh, local.dbh_sigma)
     base, _ = pairs_within(centred.position, *index.reach, MOST_PAIRS)
-    p, q, counted = index.chance, SEEN_AGAIN, min(len(local) - 2, COUNTED)
+    counted = min(len(local) - 2, COUNTED)
     hits = np.arange(counted + 2)
-    beyond = hits[math.log(1e6) + binom.logsf(hits - 1, counted, p) <= math.log(level)]
+    beyond = hits[math.log(1e6) + binom.logsf(hits - 1, counted, index.chance) <= math.log(level)]
     enough = 2 + int(beyond[0]) if len(beyond) else counted + 3
     rough, agree, looked = align_pairs(
         *_columns(centred), evenly_ordered(base)[:BASE_PAIRS],
-        *_columns(index.stems), index.pair, index.length, index.low, index.cell, index.near,
-        slack, math.log(q / p), math.log((1.0 - p) / (1.0 - q)), enough,
+        *_columns(index.stems), index.pair, index.length, index.mask, index.mask_cell, index.mask_chance,
+        index.low, index.cell, index.near, index.chance, slack, SEEN_AGAIN, enough,
     )  # fmt: skip
     best_first = np.lexsort((*rough.T, -agree))[:REFINED]
     refined = [refine(rough[k], centred, index, slack) for k in best_first]
@@ -463,7 +560,7 @@ def fix_near(
         return _fix(pose, of, centred, mean, index, slack, covariance=covariance)
     if len(at) >= 3:
         return _fix(pose, of, centred, mean, index, slack)
-    density, inside = crowding(there.as_array(), centred.position, index.stems.position, WINDOW)
+    density, inside = crowding(there.as_array(), centred.position, index.tree, WINDOW)
     return _none("no agreement", inside=inside, chance=_chance(density, centred, index, slack))
 
 
@@ -485,7 +582,7 @@ def _fix(
             )
         except np.linalg.LinAlgError:
             covariance = np.diag([1e6, 1e6, 1e6])
-    density, inside = crowding(pose, centred.position, reference.position, WINDOW)
+    density, inside = crowding(pose, centred.position, index.tree, WINDOW)
     residual = reference.position[to] - about_mean.apply(centred.position[at])
     return MapFix(
         T_map_local, mean, covariance, None, at, to, inside, second, looked,

@@ -14,7 +14,7 @@ stems that agree determine the pose well.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from pipeline.geometry.poses import Float, Pose2
 from pipeline.jit import compiled
 from pipeline.slam.places import AGREEING, WINDOW
 from pipeline.types.records import Bool, Int, Int32, Trees
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 KEPT = 48  # hypotheses that are refined
 MOST_CELLS = 1_000_000
@@ -324,20 +327,22 @@ def partners(
     return found
 
 
-def crowding(pose: Float, local: Float, reference: Float, window: float) -> tuple[float, int]:
+def crowding(pose: Float, local: Float, reference: Float | cKDTree, window: float) -> tuple[float, int]:
     """Return the density of map stems within `window` of an aligned local stem, mean over all local stems
     [1/m^2], and the number of local stems with at least one map stem within `window`.
 
     Args:
         pose: x, y [m], yaw [rad] of the local frame in the map, shape (3,).
-        local, reference: Stems, shapes (L, 2) and (N, 2) [m], L > 0.
+        local: Local stems, shape (L, 2) [m], L > 0.
+        reference: Stems of the map, shape (N, 2) [m], or their tree.
         window: Radius [m].
     """
     from scipy.spatial import cKDTree
 
     c, s = np.cos(pose[2]), np.sin(pose[2])
     place = local @ np.array([[c, s], [-s, c]]) + pose[:2]
-    near = cKDTree(reference).query_ball_point(place, window, return_length=True)
+    tree = cKDTree(reference) if isinstance(reference, np.ndarray) else reference
+    near = tree.query_ball_point(place, window, return_length=True)
     return float(near.sum() / (len(local) * np.pi * window * window)), int(np.count_nonzero(near))
 
 
