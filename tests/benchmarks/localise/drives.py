@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
 from pipeline.config import preset
@@ -124,24 +125,54 @@ class Reference:
             return cls(name, stored, kept["truth"], kept["path"])
 
 
-def frame_offset(live: Drive, stored: Drive) -> Float:
-    """Return the constant shift x, y [m] of the stems of one drive from those of another at equal true poses,
-    shape (2,), from the frames alone: the common frame of recorded drives has an error of its own."""
-    found = []
-    for k in range(20, len(live.poses), max(len(live.poses) // 40, 1)):
-        d = np.hypot(*(stored.truth[:, :2] - live.truth[k, :2]).T)
-        j = int(np.argmin(d))
-        if d[j] > 4.0:
-            continue
-        there = np.concatenate([stored.seen(m) for m in range(max(j - 2, 0), min(j + 3, len(stored.poses)))])
-        here = live.seen(k)
-        pairs = cKDTree(there).query_ball_point(here, 2.5)
-        shift = np.concatenate([there[rows] - at for rows, at in zip(pairs, here, strict=True)])
-        tree = cKDTree(shift)
-        most = max(tree.query_ball_point(shift, 0.15), key=len)
-        found.append(shift[most].mean(axis=0))
-    shift_of_all: Float = np.median(found, axis=0)
-    return shift_of_all
+def frame_offsets(live: Drive, stored: Drive, begin: int, end: int) -> Float:
+    """Return the pose x, y [m], yaw [rad] of a drive among the stems of another one less its true pose, at
+    the frames from `begin` to before `end`, shape (F, 3); NaN where they are far apart.
+
+    The common frame of recorded drives has errors that differ from place to place. They are measured in the
+    frames alone, by the stems around each place at the true poses of both drives, and interpolated.
+    """
+    rows = np.unique(np.append(np.arange(begin, end, OFFSET_EVERY), end - 1))
+    known = [(k, offset) for k in rows.tolist() if (offset := _frame_offset(live, stored, k)) is not None]
+    if not known:
+        return np.full((end - begin, 3), np.nan)
+    at, found = np.array([k for k, _ in known]), np.array([offset for _, offset in known])
+    frames = np.arange(begin, end)
+    offsets = np.column_stack([np.interp(frames, at, found[:, c]) for c in range(3)])
+    offsets[np.abs(frames[:, None] - at).min(axis=1) > OFFSET_EVERY] = np.nan
+    return offsets
+
+
+OFFSET_EVERY = 12  # frames, about 20 m: the offset changes by 2 cm
+AROUND = 6  # frames before and after a place whose stems are compared
+LARGEST = 1.5  # m; the offset is below it
+
+
+def _frame_offset(live: Drive, stored: Drive, k: int) -> Float | None:
+    """Return `frame_offsets` at a frame: the most frequent shift of the stems, then pairs and alignments."""
+    at = live.truth[k, :2]
+    near = np.flatnonzero(np.hypot(*(stored.truth[:, :2] - at).T) <= 8.0)
+    if len(near) < 3:
+        return None
+    frames = range(max(k - AROUND, 0), min(k + AROUND + 1, len(live.poses)))
+    here = np.concatenate([live.seen(m) for m in frames]) - at
+    here = here[np.hypot(*here.T) <= 20.0]
+    there = np.concatenate([stored.seen(m) for m in near]) - at
+    tree = cKDTree(there)
+    pairs = tree.query_ball_point(here, LARGEST)
+    shift = np.concatenate([there[rows] - stem for rows, stem in zip(pairs, here, strict=True)])
+    if len(shift) < 50:
+        return None
+    counts, x, y = np.histogram2d(*shift.T, bins=60, range=[[-LARGEST, LARGEST]] * 2)
+    i, j = np.unravel_index(np.argmax(uniform_filter(counts, 5, mode="constant")), counts.shape)
+    pose = np.array([0.5 * (x[i] + x[i + 1]), 0.5 * (y[j] + y[j + 1]), 0.0])
+    for gate in (0.5, 0.4, 0.3, 0.3, 0.3):
+        distance, row = tree.query(Pose2(*pose.tolist()).apply(here), distance_upper_bound=gate)
+        paired = np.isfinite(distance)
+        if np.count_nonzero(paired) < 30:
+            return None
+        pose = aligned(here[paired], there[row[paired]], np.ones(np.count_nonzero(paired)))
+    return pose
 
 
 def recorded_drive(name: str, file: Path) -> Drive:

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.stats import chi2
 
-from pipeline.geometry.poses import Float
 from pipeline.localisation import Localiser, State
-from tests.benchmarks.localise.drives import Drive, Reference
+from tests.benchmarks.localise.drives import Drive, Reference, frame_offsets
 
 WITHIN = 60.0  # m of driving
 LONGER = 20.0  # m, in which a fix is followed
@@ -30,7 +30,7 @@ class Start:
         search_s: CPU times of the scans with a search [s].
         state: State at the end.
         withdrawn: Number of withdrawn fixes.
-        sigmas: Error of the position at the end in standard deviations.
+        squared: Squared Mahalanobis distance of the position while it was found.
     """
 
     is_there: bool
@@ -41,7 +41,7 @@ class Start:
     search_s: list[float] = field(default_factory=list)
     state: State = State.SEARCHING
     withdrawn: int = 0
-    sigmas: float = math.nan
+    squared: list[float] = field(default_factory=list)
 
 
 def run_start(
@@ -49,7 +49,7 @@ def run_start(
     begin: int,
     seed: int,
     references: Sequence[Reference],
-    offsets: Sequence[Float] | None = None,
+    stored: Sequence[Drive | None] | None = None,
 ) -> list[Start]:
     """Return the results of one start of a drive in some maps; the way is mapped once.
 
@@ -58,12 +58,16 @@ def run_start(
         begin: Its first frame.
         seed: Of odometry and mapper.
         references: The stored maps.
-        offsets: Shift of the true poses of the drive in each map, see `frame_offset`; None for 0.
+        stored: The recorded drive of each map, by which the true poses are corrected, see `frame_offsets`;
+            None where the true poses share a frame.
     """
-    offsets = [np.zeros(2)] * len(references) if offsets is None else offsets
     truth, driven = drive.truth, drive.driven
     end = int(np.searchsorted(driven, driven[begin] + WITHIN + LONGER)) + 1
     end = min(end, len(truth))
+    drives = [None] * len(references) if stored is None else stored
+    offsets = [
+        np.zeros((end - begin, 3)) if of is None else frame_offsets(drive, of, begin, end) for of in drives
+    ]
     localisers = [Localiser(reference.stored) for reference in references]
     starts = [Start(reference.covers(truth[begin:end, :2])) for reference in references]
     errors: list[list[tuple[float, float]]] = [[] for _ in references]
@@ -80,15 +84,19 @@ def run_start(
                 continue
             if math.isnan(start.found):
                 start.found = got.driven
-            there, is_at = reference.there(truth[frame] + np.append(offset, 0.0)), got.T_map_odom @ pose
+            shift, is_at = offset[frame - begin], got.T_map_odom @ pose
+            there = reference.there(truth[frame] + np.nan_to_num(shift))
             if there is None:
                 start.wrong = start.wrong or not reference.covers(truth[frame : frame + 1, :2], 40.0)
                 continue
             off = there.inverse() @ is_at
-            of.append((math.hypot(off.x, off.y), abs(off.yaw)))
-            start.wrong = start.wrong or of[-1][0] > WRONG_XY or of[-1][1] > WRONG_YAW
-            sigma = math.sqrt(0.5 * (got.covariance[0, 0] + got.covariance[1, 1]))
-            start.sigmas = of[-1][0] / max(sigma, 1e-6)
+            distance = math.hypot(off.x, off.y)
+            start.wrong = start.wrong or distance > WRONG_XY or abs(off.yaw) > WRONG_YAW
+            if np.isnan(shift).any():
+                continue
+            of.append((distance, abs(off.yaw)))
+            error = np.array([is_at.x - there.x, is_at.y - there.y])
+            start.squared.append(float(error @ np.linalg.solve(got.covariance[:2, :2], error)))
     for start, of in zip(starts, errors, strict=True):
         if of:
             start.error_xy, start.error_yaw = (float(v) for v in np.median(of, axis=0))
@@ -103,7 +111,7 @@ COLUMNS = (
     "found after [m]",
     "position [cm]",
     "heading [deg]",
-    "error [sigma]",
+    "95 % covers [%]",
     "search [ms]",
     "95 % [ms]",
     "withdrawn",
@@ -113,12 +121,13 @@ COLUMNS = (
 
 def row_of(starts: Iterable[Start]) -> tuple[int | float, ...]:
     """Return the cells of COLUMNS: starts on the way of the stored drive; of these found within WITHIN, and
-    in percent; wrong fixes of all starts; median distance to the fix; medians of position, heading, and
-    position in standard deviations; median and 95 % of the search; withdrawn fixes; starts that ended in
-    "nothing of this map is here"."""
+    in percent; wrong fixes of all starts; median distance to the fix; medians of position and heading;
+    share of the positions in their 95 % intervals; median and 95 % of the search; withdrawn fixes; starts
+    that ended in "nothing of this map is here"."""
     starts = list(starts)
     there = [s for s in starts if s.is_there]
     found = [s for s in there if s.found <= WITHIN]
+    squared = np.array([d2 for s in found for d2 in s.squared])
     search = [t for s in starts for t in s.search_s] or [math.nan]
 
     def middle(values: list[float]) -> float:
@@ -133,7 +142,7 @@ def row_of(starts: Iterable[Start]) -> tuple[int | float, ...]:
         middle([s.found for s in found]),
         100.0 * middle([s.error_xy for s in found]),
         math.degrees(middle([s.error_yaw for s in found])),
-        middle([s.sigmas for s in found]),
+        100.0 * float(np.mean(squared <= chi2.ppf(0.95, 2))) if len(squared) else math.nan,
         1e3 * float(np.median(search)),
         1e3 * float(np.quantile(search, 0.95)),
         sum(s.withdrawn for s in starts),

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.localisation import Localiser, State
+from pipeline.types.records import Detections
 from tests.pipeline.localisation.stands import drive, planted, stand, stored, trees_at, way
 
 SIDE = 100.0
@@ -109,6 +110,59 @@ def test_stems_of_another_place_withdraw_a_fix():
     assert got.state is not State.FOUND
     assert got.withdrawn == 1
     assert "contradicted" in got.text or got.state is State.ABSENT
+
+
+def seen_at(base: Pose2, place) -> Detections:
+    """Stems of the local frame as detections of a scan with a standard deviation of 5 cm."""
+    n = len(place)
+    unknown = np.full(n, np.nan)
+    covariance = np.tile(0.05**2 * np.eye(2), (n, 1, 1))
+    return Detections(
+        np.arange(n), base.inverse().apply(place), covariance, unknown, unknown, unknown, unknown
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_few_stems_that_agree_elsewhere_by_chance_do_not_move_a_found_robot(seed):
+    """A scan shows five of the stems 0.7 m beside their places, and three of none."""
+    place, poses = stand(seed), way(seed, SIDE, 30.0)
+    localiser = Localiser(stored(place))
+    true, got = last(localiser, place, poses, seed)
+    base = true.inverse() @ poses[-1]
+    near = place[np.argsort(np.hypot(*(place - [poses[-1].x, poses[-1].y]).T))[:5]]
+    rng = np.random.default_rng(seed)
+    others = np.array([poses[-1].x, poses[-1].y]) + rng.uniform(-8.0, 8.0, (3, 2))
+    view = seen_at(base, true.inverse().apply(np.vstack([near + np.array([0.7, 0.0]), others])))
+    base = base @ Pose2(1.5, 0.0, 0.0)
+    none = trees_at(np.zeros((0, 2)))
+    got = localiser.update(10**11, base, none, view=view)
+    if got.T_map_odom is not None:
+        assert errors(true @ base, got.T_map_odom @ base)[0] < 0.2
+    base = base @ Pose2(1.5, 0.0, 0.0)
+    all_near = place[np.hypot(*(place - (true @ base).as_array()[:2]).T) < 14.0]
+    got = localiser.update(10**11 + 1, base, none, view=seen_at(base, true.inverse().apply(all_near)))
+    assert got.state is State.FOUND
+    assert got.withdrawn == 0
+    assert errors(true @ base, got.T_map_odom @ base)[0] < 0.1
+
+
+def test_no_pose_is_given_while_the_stems_in_view_disagree():
+    """The pose is withdrawn by the sum of the odds of several scans, of which none decides alone."""
+    place, poses = stand(1), way(1, SIDE, 30.0)
+    localiser = Localiser(stored(place))
+    true, got = last(localiser, place, poses, 1)
+    base, states = true.inverse() @ poses[-1], []
+    rng = np.random.default_rng(1)
+    for k in range(6):
+        base = base @ Pose2(1.5, 0.0, 0.0)
+        there = (true @ base).as_array()[:2] + rng.uniform(-6.0, 6.0, (300, 2))
+        away = np.min(np.hypot(*(there[:, None] - place[None]).transpose(2, 0, 1)), axis=1)
+        view = seen_at(base, true.inverse().apply(there[away > 0.8][:6]))
+        got = localiser.update(10**11 + k, base, trees_at(np.zeros((0, 2))), view=view)
+        states.append((got.state, got.withdrawn))
+        assert got.T_map_odom is None
+    assert states[0] == (State.SEARCHING, 0)
+    assert states[-1] == (State.SEARCHING, 1)
 
 
 def test_outside_of_the_map_the_covariance_grows_until_the_robot_is_searched_again():
