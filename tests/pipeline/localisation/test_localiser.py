@@ -63,6 +63,23 @@ def test_a_plantation_is_found_at_the_right_trees_or_not_at_all(seed):
             assert errors(true, got.T_map_odom)[0] < 0.5
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_equal_rows_are_not_found(seed):
+    """A plantation without gaps: each place looks like all others."""
+    grid = np.stack(np.meshgrid(np.arange(0.0, 100.0, 3.0), np.arange(0.0, 100.0, 2.0)), axis=-1)
+    place = grid.reshape(-1, 2) + np.random.default_rng(seed).normal(0.0, 0.05, (grid.size // 2, 2))
+    for _, got in drive(Localiser(stored(place)), place, way(seed, SIDE), seed):
+        assert got.state is State.SEARCHING
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sensor_upside_down_is_not_found(seed):
+    """It sees the mirror image of the stand."""
+    place = stand(seed)
+    for _, got in drive(Localiser(stored(place * [1.0, -1.0])), place, way(seed, SIDE), seed):
+        assert got.state is not State.FOUND
+
+
 @pytest.mark.parametrize("motion", [Pose2(100.0, -50.0, 2.5), Pose2(0.0, 0.0, np.pi), Pose2(-7.0, 1e4, -0.4)])
 def test_a_moved_map_gives_the_moved_fix(motion):
     place, poses = stand(1), way(1, SIDE, 30.0)
