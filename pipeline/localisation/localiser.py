@@ -5,8 +5,8 @@ The robot is mapped apart from the stored map, in the frame `odom`: that of its 
 is not found, the stems of the last metres are searched in the stored map (`search`). A fix gives T_map_odom.
 It is followed as in a Kalman filter: the drift since the last alignment makes it uncertain, and the stems in
 view, paired within that uncertainty, correct it. A few stems that agree by chance elsewhere therefore cannot
-move it. While the stems in view speak rather against the place, no pose is given; it is withdrawn when their
-odds decide.
+move it. While fewer of the stems in view agree than at a known place, no pose is given; the fix is withdrawn
+when their odds decide.
 
 The stored map is never changed.
 """
@@ -225,15 +225,15 @@ class Localiser:
         if self._odds < -ODDS:
             self._first = len(self._stamp_ns) - 1  # what was seen before is in another place of the local map
             self._search_again("contradicted", withdrawn=self.localisation.withdrawn + 1)
-        elif odds < 0.0:
+        elif fix.inside < FEWEST:
+            self._drift(prior)
+        elif fix.pose is not None and odds > 0.0 and len(fix.local) >= AGREEING * fix.inside:
+            self._use(fix, fix.pose, terrain, is_new=False)
+        else:
             self.localisation = replace(
                 self.localisation, state=State.SEARCHING, T_map_odom=None, covariance=np.zeros((3, 3)),
                 stems=len(fix.local), of=fix.inside, reason="the stems in view disagree",
             )  # fmt: skip
-        elif fix.pose is not None and odds > 0.0:
-            self._use(fix, fix.pose, terrain, is_new=False)
-        else:
-            self._drift(prior)
 
     def _prior(self) -> Float:
         """Return the covariance of the base in the map by the last alignment and the drift since then."""
@@ -271,14 +271,14 @@ class Localiser:
             self._odds = 0.0
 
     def _drift(self, covariance: Float) -> None:
-        """Keep the pose with the covariance of `_prior`; search again if it is too uncertain for a fix."""
+        """Keep the pose with the covariance of `_prior`, but none where the last stems disagreed; search
+        again if it is too uncertain for a fix."""
         if max(np.sqrt(np.diag(covariance)[:2])) > SIGMA_XY:
             self._search_again("outside of the map", withdrawn=self.localisation.withdrawn)
-            return
-        self.localisation = replace(
-            self.localisation, state=State.FOUND, T_map_odom=self._followed, reason="",
-            covariance=covariance + self._shared, stems=0, of=0,
-        )  # fmt: skip
+        elif self.localisation.T_map_odom is not None:
+            self.localisation = replace(
+                self.localisation, covariance=covariance + self._shared, stems=0, of=0
+            )
 
     @property
     def _shared(self) -> Float:

@@ -277,10 +277,10 @@ def align_pairs(
             u = (bx * px[m] + by * py[m]) / (span * mask_cell) + 0.5 * MASK
             v = (bx * py[m] - by * px[m]) / (span * mask_cell) + 0.5 * MASK
             if 0.0 <= u < MASK and 0.0 <= v < MASK:
-                bit = MASK * int(u) + int(v)
-                ahead[bit >> 6] |= np.uint64(1) << np.uint64(bit & 63)
-                bit = MASK * MASK - 1 - bit
-                back[bit >> 6] |= np.uint64(1) << np.uint64(bit & 63)
+                ahead_at = MASK * int(u) + int(v)
+                back_at = MASK * MASK - 1 - ahead_at
+                ahead[ahead_at >> 6] |= np.uint64(1) << np.uint64(ahead_at & 63)
+                back[back_at >> 6] |= np.uint64(1) << np.uint64(back_at & 63)
         inside = 0
         for word in range(mask.shape[1]):
             inside += ones(ahead[word])

@@ -157,13 +157,15 @@ def _frame_offset(live: Drive, stored: Drive, k: int) -> Float | None:
     frames = range(max(k - AROUND, 0), min(k + AROUND + 1, len(live.poses)))
     here = np.concatenate([live.seen(m) for m in frames]) - at
     here = here[np.hypot(*here.T) <= 20.0]
-    there = np.concatenate([stored.seen(m) for m in near]) - at
+    there = np.concatenate([stored.seen(m) for m in near.tolist()]) - at
     tree = cKDTree(there)
     pairs = tree.query_ball_point(here, LARGEST)
     shift = np.concatenate([there[rows] - stem for rows, stem in zip(pairs, here, strict=True)])
     if len(shift) < 50:
         return None
-    counts, x, y = np.histogram2d(*shift.T, bins=60, range=[[-LARGEST, LARGEST]] * 2)
+    counts, x, y = np.histogram2d(
+        shift[:, 0], shift[:, 1], bins=60, range=((-LARGEST, LARGEST), (-LARGEST, LARGEST))
+    )
     i, j = np.unravel_index(np.argmax(uniform_filter(counts, 5, mode="constant")), counts.shape)
     pose = np.array([0.5 * (x[i] + x[i + 1]), 0.5 * (y[j] + y[j + 1]), 0.0])
     for gate in (0.5, 0.4, 0.3, 0.3, 0.3):
