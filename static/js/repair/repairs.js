@@ -2,8 +2,10 @@
 
 import { edit, send } from "../annotate/annotations.js";
 import { byId } from "../core/dom.js";
+import { fixed } from "../core/format.js";
 import { select } from "../core/live_feed.js";
-import { nearest } from "../core/nearest.js";
+import { distance, nearest } from "../core/nearest.js";
+import { showNews } from "../core/problem.js";
 import { changed, on, selectedTree, state, trees } from "../core/store.js";
 import { colours } from "../core/theme.js";
 import { drawCircle, drawLine, drawText, treeAt } from "../map/draw.js";
@@ -101,8 +103,17 @@ export function repairClick(at, view) {
   const isOfTwo = ["merge", "tie"].includes(tool.kind);
   if (isOfTwo && (!tree || tree.number === tool.first.number)) return true;
   const [x, y] = view.toMap(...at);
+  if (tool.kind === "merge") sayIfApart(tool.first, tree);
   finish({ kind: tool.kind, places: [point(tool.first), isOfTwo ? point(tree) : [x, y]] });
   return true;
+}
+
+// Two trees that are farther apart than one thing can be are merged as well: the path may have drifted between them.
+function sayIfApart(one, other) {
+  const apart = distance(one, other);
+  if (apart > (state.annotations?.same_thing_m ?? Infinity)) {
+    showNews(`Trees ${one.number} and ${other.number} were ${fixed(apart, 1)} m apart: Undo takes the merge back if they are two trees.`);
+  }
 }
 
 function finish(fields) {

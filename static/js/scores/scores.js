@@ -69,7 +69,7 @@ function nothing() {
   if (!state.map) return el("p", { class: "empty", text: nothingYet() });
   return el("div", { class: "empty" },
     el("p", { text: state.annotations?.own == null
-      ? "This run has no ground truth to score the map against. Annotate trees, or open a simulated run."
+      ? "This run has no ground truth to score the map against. Annotate trees or import measured ones (CSV) in Annotate, or open a simulated run."
       : "The map is to be scored against annotations only, and there are none. Annotate trees, or score against the ground truth of the run." }),
     state.annotations?.own == null ? el("button", { text: "Open a simulated run", onclick: openSources })
       : el("button", { text: "Score against ground truth and annotations", onclick: () => scoreAgainst("both") }));
