@@ -259,8 +259,9 @@ class LidarOdometry:
             span_s = (middle_ns - before_ns) * 1e-9
             largest = np.array([FASTEST, FASTEST, FASTEST_TURN]) * span_s
             of_scan, disagreement = self._covariance(upright, above, largest)
-            T, difference = fused(T, above, of_scan)
             self._disagreement += (disagreement - self._disagreement) * min(span_s * 1e9 / LOST_NS, 1.0)
+            is_shown = bool((np.diag(of_scan) < SHOWN).all()) and self._disagreement <= CONTRADICTED
+            T, difference = fused(T, above, of_scan, is_shown=is_shown)
             of_scan *= max(self._disagreement / 3.0, 1.0)
             if difference is not None:  # the covariance is that of the pose that is not used
                 of_scan = WHOLE + np.outer(difference, difference)
@@ -476,21 +477,26 @@ def _planar_of(T: Float, planar: Float) -> Float:
     return combined
 
 
-def fused(whole: Float, above: Float, covariance: Float) -> tuple[Float, Float | None]:
+def fused(whole: Float, above: Float, covariance: Float, *, is_shown: bool) -> tuple[Float, Float | None]:
     """Return the mean of two poses that differ in x, y and yaw, weighted by their inverse covariances, and
-    None; if they contradict each other (CONTRADICTED), the first pose and their difference x, y [m], yaw
-    [rad] in its frame, shape (3,).
+    None.
+
+    If they contradict each other (CONTRADICTED), one of them is returned: the second one and None if it shows
+    the motion, because the rings on the ground, which move with the sensor, then pull the first one. Those of
+    a tilted LiDAR are no circles around it and pull its yaw, too. Else the first one, and their difference
+    x, y [m], yaw [rad] in its frame, shape (3,).
 
     Args:
         whole: Pose by the whole cloud, with the covariance WHOLE, shape (4, 4).
         above: Pose by the points above the ground, shape (4, 4).
         covariance: Its covariance, shape (3, 3), of x, y [m], yaw [rad] in the frame of `whole`.
+        is_shown: Whether the points above the ground show the motion (SHOWN), and their surfaces one motion.
     """
     apart = np.linalg.inv(whole) @ above
     d = np.array([apart[0, 3], apart[1, 3], np.arctan2(apart[1, 0], apart[0, 0])])
     weighted = np.linalg.solve(WHOLE + covariance, d)
     if float(d @ weighted) > CONTRADICTED:
-        return whole, d
+        return (above, None) if is_shown else (whole, d)
     x, y, yaw = (WHOLE @ weighted).tolist()
     share = Pose3.from_euler(np.array([x, y, 0.0]), 0.0, 0.0, yaw)
     T = np.eye(4)
