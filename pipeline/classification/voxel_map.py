@@ -60,8 +60,9 @@ TILE_CELLS = 40  # columns are classified by tiles of 4 m
 TILE = TILE_CELLS * SIDE
 # Classified per scan after the first scans, of which a short recording may have no others.
 MOST_TILES, FIRST_SCANS = 4, 10
-# Voxels in the tiles that one of the first scans classifies, which determine its time: all voxels of one scan
-# of 64 rings (28,600 in a street, KITTI), and all of the first ten scans of 16 rings (18,000 in sim:stand).
+# Voxels in the tiles that each of the first scans after the first one classifies, which set its time: all
+# voxels of one scan of 64 rings (28,600 in a street, KITTI), and all of ten scans of 16 rings (18,000 in
+# sim:stand).
 MOST_VOXELS = 1 << 15
 _OFFSET = TILE_CELLS << 18  # cells; keys stay positive within 1,000 km of the origin
 _FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
@@ -188,16 +189,16 @@ class VoxelMap:
         more than the factor `grown` since they were last classified, and mark them as classified. Tiles that
         were never classified are due.
 
-        Of the tiles with the largest growth (of equal ones the older) so many are returned as have together
-        at most MOST_VOXELS voxels, but at least one; after FIRST_SCANS scans at most MOST_TILES. The others
-        remain due."""
+        After the first scan, which may be the only one, so many of the tiles with the largest growth (of
+        equal ones the older) are returned as have together at most MOST_VOXELS voxels, but at least one;
+        after FIRST_SCANS scans at most MOST_TILES. The others remain due."""
         n = self.tiles
         returns, judged = self.tile_returns[:n], self.tile_judged[:n]
         due = np.flatnonzero(returns > grown * judged)
         due = due[np.argsort(-(returns[due] / np.maximum(judged[due], 1)), kind="stable")]
         if self.added > FIRST_SCANS:
             due = due[:MOST_TILES]
-        elif self.used > MOST_VOXELS:
+        elif self.added > 1 and self.used > MOST_VOXELS:
             voxels = np.bincount(self.home[: self.used], minlength=n)[due]
             due = due[: max(np.searchsorted(np.cumsum(voxels), MOST_VOXELS, side="right"), 1)]
         due = np.sort(due)

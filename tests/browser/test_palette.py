@@ -102,6 +102,8 @@ def test_actions_are_found_and_executed(dashboard: Dashboard):
     find.fill("preset forest")
     find.press("Enter")
     dashboard.until_server("/api/parameters", "it.preset === 'forest'")
+    dashboard.tab("Trees")
+    dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 20")  # more than by `paper`
     number = page.locator("#trees tbody tr").first.get_attribute("data-tree")
     page.keyboard.press("Control+k")
     find.fill(f"tree {number}")

@@ -26,6 +26,9 @@ from tests.benchmarks.machine import resident_mib
 MOST = 1 << 16
 
 
+NOTHING = np.zeros((0, 3), np.float32)
+
+
 def cloud(seed: int, n: int = 500, spread: float = 5.0):
     rng = np.random.default_rng(seed)
     rows = np.column_stack([spread * rng.standard_normal((n, 2)), rng.uniform(-1.0, 7.0, n)])
@@ -94,6 +97,8 @@ def test_a_tile_is_due_when_it_has_grown_and_few_are_due_at_once():
 def test_due_tiles_have_a_bounded_number_of_voxels_and_all_have_their_turn(monkeypatch):
     memory = VoxelMap.empty()
     memory.add(cloud(1, 3000), 0, MOST)
+    assert len(memory.copy().due_tiles(1.1)) == memory.tiles  # of a first scan, which may be the only one
+    memory.add(NOTHING, 1, MOST)
     voxels = dict(
         zip(map(tuple, memory.copy().due_tiles(1.1)), np.bincount(memory.home[: memory.used]), strict=True)
     )
@@ -110,6 +115,7 @@ def test_due_tiles_have_a_bounded_number_of_voxels_and_all_have_their_turn(monke
 def test_one_tile_with_more_voxels_than_the_bound_is_due(monkeypatch):
     memory = VoxelMap.empty()
     memory.add(cloud(1, 3000), 0, MOST)
+    memory.add(NOTHING, 1, MOST)
     monkeypatch.setattr("pipeline.classification.voxel_map.MOST_VOXELS", 1)
     assert len(memory.due_tiles(1.1)) == 1
 
