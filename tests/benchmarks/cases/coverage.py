@@ -34,7 +34,9 @@ def run() -> list[Table]:
         "seed", "sensor", "length [m]", "first drive [%]", "driven on [%]", "after the way [%]",
         "gain [points]",
     )  # fmt: skip
-    return [Table(LINE, columns, tuple(rows), ("Share of the confirmed trees that have a diameter.",))]
+    return [
+        Table(LINE, columns, tuple(rows), ("Share of the trees of the first drive that have a diameter.",))
+    ]
 
 
 class _Mapped(NamedTuple):
@@ -50,12 +52,15 @@ class _Mapped(NamedTuple):
     trees: Trees
     seen: SeenRecorder
 
-    @property
-    def share(self) -> float:
-        """Share of the trees with a diameter."""
+    def share(self, place: Float) -> float:
+        """Return the share of the trees at places of the map, shape (K, 2) [m], that have a diameter here."""
         import numpy as np
 
-        return float(np.isfinite(self.trees.dbh).mean())
+        from pipeline.config import preset
+        from pipeline.evaluation import match
+
+        tree = match(place, self.trees.position, preset("forest").evaluation.match_distance)
+        return float((np.isfinite(self.trees.dbh[tree]) & (tree >= 0)).mean())
 
 
 def _stand(seed: int) -> tuple[tuple[Cell, ...], tuple[float, float, float]]:
@@ -83,10 +88,14 @@ def _stand(seed: int) -> tuple[tuple[Cell, ...], tuple[float, float, float]]:
         mapped.seen.area(mapped.path),
         parameters.obstacles.width,
     )
+    place = mapped.trees.position
+    share = mapped.share(place)
     if found is None:
-        return (seed, first.lidar.name, 0.0, 100.0 * mapped.share, *[None] * 3), (mapped.share,) * 3
-    on, way = (_map(_driven_on(first, corners, found.length)).share for corners in (None, found.points))
-    shares = mapped.share, on, way
+        return (seed, first.lidar.name, 0.0, 100.0 * share, *[None] * 3), (share,) * 3
+    on, way = (
+        _map(_driven_on(first, corners, found.length)).share(place) for corners in (None, found.points)
+    )
+    shares = share, on, way
     percent = [100.0 * share for share in shares]
     return (seed, first.lidar.name, found.length, *percent, percent[2] - percent[1]), shares
 
