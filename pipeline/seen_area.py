@@ -211,7 +211,7 @@ class SeenRecorder:
             cells.append(place[seen])
             distance.append(reach[seen])
             rows += len(cells[-1])
-            if rows >= ROWS_MOST:
+            if rows >= max(ROWS_MOST, len(area.place)):  # each time the whole area is sorted
                 area = _with_views(area, cells, distance)
                 cells, distance, rows = [], [], 0
         return _with_views(area, cells, distance)

@@ -102,6 +102,7 @@ class TreeLog:
         self._scans[index], self._sizes[index] = known, size
         if self._nbytes > MOST_BYTES:
             self._scans.clear()
+            self._sizes.clear()
 
     def lean(self, columns: Columns) -> Columns:
         """Return columns with axes and votes only; the other arrays are empty. Columns with the same axes

@@ -110,7 +110,8 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
     """
     if settings.folder is None:
         raise StemmapError(
-            "there is no data folder", remedy="Set STEMMAP_FOLDER, or name a file: --record FILE.mcap"
+            "there is no data folder for a recording",
+            remedy="Leave out the recording, set STEMMAP_FOLDER, or name a file: --record FILE.mcap",
         )
     return settings.folder / "recordings" / time.strftime("live-%Y%m%d-%H%M%S.mcap", time.gmtime(now_s))
 

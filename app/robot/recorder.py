@@ -69,12 +69,16 @@ class Recorder:
 
     @property
     def status(self) -> str:
-        """The file and its size, or the reason why the recording ended, as one line."""
+        """The file and its size, or the reason why the recording ended, as one line; "" without a file."""
         if self.problem:
             return f"not recording: {self.problem}"
         lost = sum(self.losses.values())
         missing = f", {lost:,} messages missing because the disk is too slow" if lost else ""
-        word = "recorded" if self._closing.is_set() else "recording"
+        word = "recording"
+        if self._closing.is_set():
+            if self._thread is None:
+                return ""  # it ended before the first message, and the empty file is deleted
+            word = "finishing" if self._thread.is_alive() else "recorded"
         return f"{word} {self.path.name}, {self._file.tell() / 1e6:.0f} MB{missing}"
 
     def begin(self, channels: Sequence[Channel], header: Mapping[str, Any], robot: str) -> None:

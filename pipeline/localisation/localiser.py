@@ -175,7 +175,7 @@ class Localiser:
     def match(self) -> Match | None:
         """The present fix as the match of the local map with the stored one; None unless found."""
         fix = self._fix
-        if fix is None:
+        if fix is None or self.localisation.T_map_odom is None:
             return None
         alarms = false_alarms(len(fix.local), max(fix.inside, len(fix.local)), fix.looked, fix.chance)
         covariance = fix.covariance_at(np.zeros(2))
@@ -222,13 +222,17 @@ class Localiser:
         fix = fix_near(self._followed, self._in_view(trees), index, self._slack, Prior(base, prior))
         odds = _log_odds(len(fix.local), fix.inside, fix.chance) if fix.inside >= FEWEST else 0.0
         self._odds = min(self._odds + odds, 0.0)  # cumulative sum (Page 1954)
+        # After a pause the prior is wide, and few stems agree with it by chance: as much as for a first fix.
+        needed = 0.0 if self.localisation.T_map_odom is not None else ODDS
         if self._odds < -ODDS:
             self._first = len(self._stamp_ns) - 1  # what was seen before is in another place of the local map
             self._search_again("contradicted", withdrawn=self.localisation.withdrawn + 1)
         elif fix.inside < FEWEST:
             self._drift(prior)
-        elif fix.pose is not None and odds > 0.0 and len(fix.local) >= AGREEING * fix.inside:
+        elif fix.pose is not None and odds > needed and len(fix.local) >= AGREEING * fix.inside:
             self._use(fix, fix.pose, terrain, is_new=False)
+        elif _is_uncertain(prior):
+            self._search_again("the stems in view disagree", withdrawn=self.localisation.withdrawn)
         else:
             self.localisation = replace(
                 self.localisation, state=State.SEARCHING, T_map_odom=None, covariance=np.zeros((3, 3)),
@@ -273,7 +277,7 @@ class Localiser:
     def _drift(self, covariance: Float) -> None:
         """Keep the pose with the covariance of `_prior`, but none where the last stems disagreed; search
         again if it is too uncertain for a fix."""
-        if max(np.sqrt(np.diag(covariance)[:2])) > SIGMA_XY:
+        if _is_uncertain(covariance):
             self._search_again("outside of the map", withdrawn=self.localisation.withdrawn)
         elif self.localisation.T_map_odom is not None:
             self.localisation = replace(
@@ -331,6 +335,11 @@ def _log_odds(k: int, n: int, p: float) -> float:
     q = max(AGREEING, p)
     p = min(max(p, 1e-6), 1.0 - 1e-6)
     return k * math.log(q / p) + (n - k) * math.log((1.0 - q) / (1.0 - p))
+
+
+def _is_uncertain(covariance: Float) -> bool:
+    """Return whether a pose of the base in the map is too uncertain for a fix."""
+    return bool(max(np.sqrt(np.diag(covariance)[:2])) > SIGMA_XY)
 
 
 def _would_be_found(fix: MapFix, n: int, of: int, level: float) -> bool:

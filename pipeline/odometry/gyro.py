@@ -42,7 +42,7 @@ SLIPPED = "the turns of the wheels and the gyroscope differ: the wheels slip"
 UNUSED = "the turns of the LiDAR odometry and the gyroscope differ: the gyroscope is not used there"
 MIRRORED = (
     "the LiDAR odometry turns against the gyroscope: one axis of the points has the wrong sign, and the map "
-    "is a mirror image, or the gyroscope has the wrong sign, and the map is right"
+    "is a mirror image, or the gyroscope or the accelerometer has the wrong sign, and the map is right"
 )
 
 

@@ -260,9 +260,10 @@ class LidarOdometry:
             largest = np.array([FASTEST, FASTEST, FASTEST_TURN]) * span_s
             of_scan, disagreement = self._covariance(upright, above, largest)
             self._disagreement += (disagreement - self._disagreement) * min(span_s * 1e9 / LOST_NS, 1.0)
-            is_shown = bool((np.diag(of_scan) < SHOWN).all()) and self._disagreement <= CONTRADICTED
+            doubt = max(self._disagreement / 3.0, 1.0)
+            is_shown = bool((doubt * np.diag(of_scan) < SHOWN).all()) and self._disagreement <= CONTRADICTED
             T, difference = fused(T, above, of_scan, is_shown=is_shown)
-            of_scan *= max(self._disagreement / 3.0, 1.0)
+            of_scan *= doubt
             if difference is not None:  # the covariance is that of the pose that is not used
                 of_scan = WHOLE + np.outer(difference, difference)
             step = np.linalg.inv(self._T_odom_base) @ T

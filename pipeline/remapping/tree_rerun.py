@@ -21,6 +21,7 @@ from pipeline.tree_log import LoopSearch, TreeCorrection, TreeInput, TreeLog, Tr
 from pipeline.types.records import Float, Int, Int32, Path, Trees
 
 KEPT_EVERY = 50  # scans between two states of the trees that are kept, as between states of the mapper
+MOST_STATES = 32  # then every second one is left out; a state has 320 bytes per tree
 
 
 class TreeReplay:
@@ -75,23 +76,28 @@ class ScanTrees(NamedTuple):
 
 
 class TreesByScan:
-    """The trees after each scan of a rerun of the trees. A few states are kept; the trees of a scan are made
-    from the state before it when they are asked for."""
+    """The trees after each scan of a rerun of the trees. At most MOST_STATES states are kept; the trees of a
+    scan are made from the state before it when they are asked for."""
 
     def __init__(self) -> None:
-        self._states: list[TreeReplay] = []  # before every KEPT_EVERY-th scan
+        self._every = KEPT_EVERY
+        self._states: list[TreeReplay] = []  # before every `_every`-th scan
         self._scans: list[TreeInput] = []
         self._last: TreeReplay | None = None
 
     def put(self, before: TreeReplay, known: TreeInput) -> None:
         """Add the next scan: the state before it, and its entry in the log."""
-        if before.done % KEPT_EVERY == 0:
-            self._states.append(before.copy())
+        if before.done % self._every == 0:
+            if len(self._states) == MOST_STATES:
+                self._every *= 2
+                del self._states[1::2]
+            if before.done % self._every == 0:
+                self._states.append(before.copy())
         self._scans.append(known)
 
     def at(self, index: int) -> ScanTrees:
         """Return the trees after a scan."""
-        start, last = self._states[index // KEPT_EVERY], self._last
+        start, last = self._states[index // self._every], self._last
         replay = last if last is not None and start.done <= last.done <= index + 1 else start.copy()
         while replay.done <= index:
             known = self._scans[replay.done]

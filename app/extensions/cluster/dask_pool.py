@@ -80,22 +80,26 @@ class DaskPool:
             self._futures.add(future)
             return future
 
-        future = submit(workers=[preferred], allow_other_workers=True)
-        is_free, seen_s = False, time.monotonic()  # of a preference; when the cluster last had a worker
+        is_free = preferred not in client.nthreads()  # of a preference
+        future = submit() if is_free else submit(workers=[preferred], allow_other_workers=True)
+        seen_s = time.monotonic()  # when the cluster last had a worker
         while True:
             try:
                 result: bytes = future.result(_POLL_S)
                 self._futures.discard(future)
                 return result
             except TimeoutError:
-                if future.done():  # the exception of the task itself
+                if future.status == "error":  # the exception of the task itself
                     raise
+                if future.done():
+                    continue
             workers = client.nthreads()
             if workers:
                 seen_s = time.monotonic()
             elif time.monotonic() - seen_s > _PATIENCE_S:
                 raise TimeoutError("all workers of the cluster are gone")
-            if not is_free and preferred not in workers:
+            is_assigned = any(future.key in keys for keys in client.processing().values())
+            if not is_free and preferred not in workers and not is_assigned:
                 # If no other worker was there at that moment, the scheduler never assigns the task again:
                 # it looks for tasks that a new worker may take by their preference alone.
                 client.cancel([future], reason="the worker is gone")

@@ -33,6 +33,10 @@ NEAREST_VIEW, FARTHEST_VIEW = 1.0, 8.0
 MOST = 0.9
 #: Length that each further place costs besides its distance, so that near places are not all visited [m].
 STOP_COST = 2.0
+#: Length within which the next place is searched first [m]: three times the view.
+NEARBY = 25.0
+#: Radius of a stem without a diameter [m], for the clearance: 1 % of the stems of a stand are thicker.
+UNKNOWN_RADIUS = 0.3
 
 
 class Detour(NamedTuple):
@@ -63,15 +67,15 @@ def shortest_detour(
 
     Args:
         start: Position of the robot, shape (2,) [m].
-        position, radius: Positions of all trees, shape (N, 2), and their radii, shape (N,) [m].
+        position, radius: Positions of all trees, shape (N, 2), and their radii, shape (N,) [m], NaN where
+            unknown.
         sides: Sectors from which each tree without a diameter was seen, see `Trees.sides`; None for the
             others.
         arc: Arc that a diameter needs [rad].
         seen: The observed area; the way stays in it.
         width: Width of the robot with its lateral clearance [m].
     """
-    from scipy.sparse.csgraph import dijkstra
-
+    radius = np.where(np.isfinite(radius), radius, UNKNOWN_RADIUS)
     graph, centres = _walkable(position, radius, seen, width)
     wanted = [row for row, bits in enumerate(sides) if bits is not None]
     known = np.array([sides[row] for row in wanted], np.int64)
@@ -83,23 +87,20 @@ def shortest_detour(
     cell = int(np.argmin(np.hypot(*(centres - start).T)))
     way, missing = [cell], lacking
     while missing.sum() > (1.0 - MOST) * lacking.sum():
-        distance, before = dijkstra(graph, indices=way[-1], return_predecessors=True)
-        lack = needed - np.bitwise_count(known[missing]).astype(np.int64)
-        gain = np.minimum(np.bitwise_count(views[:, missing] & ~known[missing]), lack) / lack  # of a tree
-        ratio = gain.sum(axis=1) / (distance + STOP_COST)
-        best = int(np.argmax(ratio))
-        if ratio[best] == 0.0:
+        lack = np.maximum(needed - np.bitwise_count(known).astype(np.int64), 1)[views.tree]
+        new = np.minimum(np.bitwise_count(views.sectors & ~known[views.tree]), lack) / lack  # of a tree
+        gain = np.bincount(views.cell, new * missing[views.tree], len(centres)).astype(np.float64)
+        leg = _best_leg(graph, way[-1], gain)
+        if not leg:
             break
-        leg = [best]
-        while leg[-1] != way[-1]:
-            leg.append(int(before[leg[-1]]))
-        way += leg[-2::-1]
-        known |= np.bitwise_or.reduce(views[leg], axis=0)
+        way += leg
+        on_leg = np.isin(views.cell, leg)
+        np.bitwise_or.at(known, views.tree[on_leg], views.sectors[on_leg])
         missing = lacking & (np.bitwise_count(known) < needed)
     completed = lacking & ~missing
     if not completed.any() or len(way) == 1:
         return None
-    points = np.concatenate([np.reshape(start, (1, 2)), _straightened(centres[way], seen.cell)])
+    points = np.concatenate([np.reshape(start, (1, 2)), _straightened(centres[way], 0.5 * seen.cell)])
     length = float(np.hypot(*np.diff(points, axis=0).T).sum())
     return Detour(points, [wanted[k] for k in np.flatnonzero(completed)], length)
 
@@ -126,11 +127,19 @@ def _walkable(position: Float, radius: Float, seen: SeenArea, width: float) -> t
     return csr_array((np.tile(lengths, 2), (rows, columns)), shape=(len(centres),) * 2), centres
 
 
-def _views(places: Float, wanted: Sequence[int], position: Float, radius: Float) -> Int:
-    """Return the sectors of the wanted trees that a view from a place shows as a whole, as bits, int64, shape
-    (K, W); 0 if the place is too near or too far, or another stem is in between."""
-    found = np.zeros((len(places), len(wanted)), np.int64)
-    middles = (np.arange(SECTORS) + 0.5) * WIDTH
+class _Views(NamedTuple):
+    """What is shown of trees from cells, a row per pair: `cell`, `tree`, and `sectors`, the bits of the
+    sectors of the tree that a view from the cell shows as a whole; each int64, shape (M,)."""
+
+    cell: Int
+    tree: Int
+    sectors: Int
+
+
+def _views(places: Float, wanted: Sequence[int], position: Float, radius: Float) -> _Views:
+    """Return the views of the wanted trees (by their index in `wanted`) from the places that are neither too
+    near nor too far, without another stem in between."""
+    rows, middles = [], (np.arange(SECTORS) + 0.5) * WIDTH
     for column, tree in enumerate(wanted):
         there = places - position[tree]
         distance = np.hypot(*there.T)
@@ -138,8 +147,27 @@ def _views(places: Float, wanted: Sequence[int], position: Float, radius: Float)
         near = near[~_hidden(places[near], tree, position, radius)]
         bearing = np.arctan2(there[near, 1], there[near, 0])
         apart = np.abs((middles - bearing[:, None] + np.pi) % (2.0 * np.pi) - np.pi)
-        found[near, column] = (apart <= 0.5 * (VIEW_ARC - WIDTH)) @ (1 << np.arange(SECTORS))
-    return found
+        sectors = (apart <= 0.5 * (VIEW_ARC - WIDTH)) @ (1 << np.arange(SECTORS))
+        rows.append(np.stack([near, np.full(len(near), column), sectors]))
+    return _Views(*np.concatenate(rows, axis=1))
+
+
+def _best_leg(graph: csr_array, start: int, gain: Float) -> list[int]:
+    """Return the cells from a cell to the one with the largest ratio of gain to distance, without the first;
+    [] if no other one that can be reached has a gain. Cells beyond NEARBY count only if no nearer one has."""
+    from scipy.sparse.csgraph import dijkstra
+
+    gain[start] = 0.0
+    for limit in (NEARBY, np.inf):
+        distance, before = dijkstra(graph, indices=start, return_predecessors=True, limit=limit)
+        ratio = gain / (distance + STOP_COST)
+        best = int(np.argmax(ratio))
+        if ratio[best] > 0.0:
+            leg = [best]
+            while leg[-1] != start:
+                leg.append(int(before[leg[-1]]))
+            return leg[-2::-1]
+    return []
 
 
 def _hidden(places: Float, tree: int, position: Float, radius: Float) -> Bool:

@@ -167,7 +167,7 @@ def detour(question: dict[str, Any]) -> dict[str, Any]:
     found = shortest_detour(
         np.array([run.path.x[-1], run.path.y[-1]]),
         run.trees.position,
-        0.5 * np.nan_to_num(run.trees.dbh),
+        0.5 * run.trees.dbh,
         sides,
         radians(run.parameters.tracking.dbh_arc_min),
         seen,

@@ -36,7 +36,7 @@ from pipeline.io.readers.transforms import Extrinsics, TransformTree
 from pipeline.types.records import Imu, Notice, Record, Scan, Sensor, Truth
 
 CONTRADICTION = (
-    "scans whose motion contradicts that of the odometry: it is of another robot, or its wheels slip, and "
+    "motions of scans that contradict the odometry: it is of another robot, or its wheels slip, and "
     "the map may be wrong; --odometry lidar uses the scans alone"
 )
 #: Number of IMU messages in which an orientation is looked for.

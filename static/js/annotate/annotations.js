@@ -242,7 +242,11 @@ export async function review(kind) {
     return news();
   }
   if (draft.shown === tree.number && !answering.has(tree.number)) await answer(tree, kind);
-  else showNews(`The key did not count: tree ${tree.number} was still loading.`);
+  else sayNotCounted(tree.number);
+}
+
+function sayNotCounted(number) {
+  showNews(answering.has(number) ? `Not counted: the answer before on tree ${number} is being stored.` : `Not counted: tree ${number} is still loading.`);
 }
 
 async function answer(tree, kind) {
@@ -288,7 +292,7 @@ export async function skip() {
   draft.error = "";
   if (!tree || reviewOf(tree) !== "open" || answering.has(tree.number)) await next();
   else if (draft.shown === tree.number) await answer(tree, SKIPPED);
-  else showNews(`The key did not count: tree ${tree.number} was still loading.`);
+  else sayNotCounted(tree.number);
 }
 
 // Selects the most doubtful open tree other than the selected one; without one, the skipped tree that follows the selected one.

@@ -26,7 +26,7 @@ export const card = (hint) => el("article", { id: "review", class: "review", "ar
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
-const subjectOf = (number) => `${state.annotations?.run} ${number} ${state.parameters?.revision}`;
+const subjectOf = (number) => `${state.annotations?.run} ${number} ${state.parameters?.revision} ${state.remapped?.revision}`;
 
 // The story of a tree at this scan, or, for `atAnyScan`, one that was loaded ahead while the run plays on.
 function story(number, atAnyScan = false) {
@@ -63,9 +63,12 @@ const refresh = keepFresh(async () => {
   byId("review-votes").replaceChildren(votes);
   evidence().dataset.tree = String(number);
   fillCard();
+  if (loaded && loaded !== `${subject} ${state.map.index}`) again(); // it was loaded ahead, at an earlier scan
   const ahead = following();
   if (ahead) story(ahead.number, true).promise.catch(() => undefined); // the card shows its error when it comes to it
 }, PAUSE);
+
+const again = throttled(refresh, EVERY);
 
 // The selection may have changed when a person leaves the field: its DBH belongs to the tree that the field shows.
 function takeDbh({ target }) {

@@ -7,7 +7,7 @@ import { on, state } from "../core/store.js";
 import { parametersText } from "../playback/timeline.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { completion, isListed, listPlaces, nearMisses, sift } from "./places.js";
-import { recordingOf, showRobot, startRobotForm } from "./robot_form.js";
+import { isLive, recordingOf, showRobot, startRobotForm } from "./robot_form.js";
 import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
@@ -39,9 +39,9 @@ export function connectRobot() {
 
 // A place of the list is opened, or written into the field if something is chosen for it first.
 function choose(uri) {
-  if (!ofExtensions("sourceChoice").some((each) => each.takes(uri))) return ask(uri);
+  if (!isLive(uri) && !ofExtensions("sourceChoice").some((each) => each.takes(uri))) return ask(uri);
   byId("source-uri").value = uri;
-  show();
+  byId("source-uri").dispatchEvent(new Event("input"));
   return byId("source-open").focus();
 }
 
@@ -89,6 +89,8 @@ function finish(message) {
   setText(byId("source-open"), "Open");
   if (message) return say(message);
   byId("source-uri").value = "";
+  byId("source-robot").open = false;
+  byId("source-uri").dispatchEvent(new Event("input"));
   dialog.close();
 }
 

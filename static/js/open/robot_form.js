@@ -2,7 +2,7 @@
 
 import { byId, el, recall, remember } from "../core/dom.js";
 
-const LIVE = /^(zenoh|velodyne|dds):/i;
+export const isLive = (address) => /^(zenoh|velodyne):/i.test(address);
 // For each kind: title, fields [name, title, value without another one], and the address of their values.
 const KINDS = {
   zenoh: {
@@ -27,7 +27,7 @@ const kind = () => KINDS[byId("robot-kind").value];
 const fields = () => byId("robot-fields");
 
 // Whether the run of an address is recorded: {record: true}, or {} if it is not live.
-export const recordingOf = (address) => (LIVE.test(address) && byId("source-record").checked ? { record: true } : {});
+export const recordingOf = (address) => (isLive(address) && byId("source-record").checked ? { record: true } : {});
 
 export function showRobot() {
   byId("source-robot").open = true;
@@ -57,7 +57,7 @@ export function startRobotForm() {
   const record = byId("source-record");
   record.checked = recall("record") !== "no"; // what was not recorded is lost
   record.addEventListener("change", () => remember("record", record.checked ? "yes" : "no"));
-  const show = () => { byId("source-recorded").hidden = !LIVE.test(uri()) && !byId("source-robot").open; };
+  const show = () => { byId("source-recorded").hidden = !isLive(uri()); };
   byId("source-uri").addEventListener("input", show);
   byId("source-robot").addEventListener("toggle", ({ target }) => {
     if (target.open && !uri()) write();

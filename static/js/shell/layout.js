@@ -30,6 +30,8 @@ const stored = (key) => {
     return {}; // not written by this page
   }
 };
+// A layout that an earlier version stored may lack a size, or have another one.
+const completed = (one) => Object.fromEntries(Object.keys(STANDARD).map((key) => [key, one?.[key] ?? STANDARD[key]]));
 const clipped = (percent) => Math.min(MOST, Math.max(LEAST, Number(percent) || LEAST));
 const all = () => ({ ...BUILT_IN, ...saved });
 const same = (one) => Object.keys(STANDARD).every((key) => one[key] === layout[key]);
@@ -137,6 +139,6 @@ export function startLayout() {
   startSplitter("split-left", () => "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
   startSplitter("split-top", height, { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (isTuning() ? box.bottom - event.clientY : event.clientY - box.top)) / box.height);
   on("tab", show);
-  saved = stored("layouts");
+  saved = Object.fromEntries(Object.entries(stored("layouts")).map(([name, one]) => [name, completed(one)]));
   setLayout(stored("layout"));
 }

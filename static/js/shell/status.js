@@ -150,7 +150,6 @@ function showState() {
   box.classList.toggle("going", state.connected && isGoing(state.status));
   setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.refused ? "No access" : state.lostAt ? "No connection" : "Connecting");
   box.title = robotsTitle(state.status);
-  const recording = state.status?.recording ?? "";
   showRecording(state.status?.recording ?? "");
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
   const quiet = isOld();
@@ -173,7 +172,7 @@ function showRecording(recording) {
 export const isRecording = () => (state.status?.recording ?? "").startsWith("recording");
 export const endRecording = edits(() => attempted(async () => {
   await command("end_recording");
-  showNews("The recording is finished. The run goes on.");
+  showNews("The recording is being finished. The run goes on.");
 }));
 
 // Whether a run plays and no message came for a while.

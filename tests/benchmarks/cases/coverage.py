@@ -79,7 +79,7 @@ def _stand(seed: int) -> tuple[tuple[Cell, ...], tuple[float, float, float]]:
     found = shortest_detour(
         np.array([mapped.path.x[-1], mapped.path.y[-1]]),
         mapped.trees.position,
-        0.5 * np.nan_to_num(mapped.trees.dbh),
+        0.5 * mapped.trees.dbh,
         [
             None if is_known else bits
             for is_known, bits in zip(known, mapped.trees.sides.tolist(), strict=True)

@@ -46,6 +46,7 @@ from pipeline.errors import StemmapError
 router = APIRouter(prefix="/api")
 
 MOST_PLOTS = 500
+_DETOUR_S = 60.0
 _MOST_CORNERS = 20_000  # of all plots, which every browser receives with each edit
 _LONGEST_NAME = 60
 _Size = Annotated[float, Field(gt=0.0, le=2000.0)]
@@ -132,14 +133,22 @@ async def figures(dashboard: Dash, parameters: FigureParameters) -> Response:
 @router.get("/detour", dependencies=[ViewerTurn])
 async def detour(dashboard: Dash) -> Response:
     """Return the way that shows trees without a diameter from further sides, see
-    `app.extensions.stand.questions.detour`; a child process computes it. 409 before the first map."""
+    `app.extensions.stand.questions.detour`; a child process computes it, one at a time. 409 before the first
+    map, 422 if it takes too long."""
     run = ShownRun.of(dashboard)
     trees, sides = run.shown.frame.trees, dict[int, int]()
     if trees.sides is not None:
         lacking = trees.confirmed & np.isnan(trees.dbh)
         sides = dict(zip(trees.number[lacking].tolist(), trees.sides[lacking].tolist(), strict=True))
-    async with in_thread(run.folder()) as folder:
-        return json_reply(await opening.ask({"ask": DETOUR, "path": str(folder), "sides": sides}))
+    with as_bad_request():
+        async with dashboard.exporting, in_thread(run.folder()) as folder:
+            try:
+                question = {"ask": DETOUR, "path": str(folder), "sides": sides}
+                return json_reply(await opening.ask(question, patience_s=_DETOUR_S))
+            except opening.TookTooLongError:
+                raise StemmapError(
+                    f"the way takes longer than {_DETOUR_S:.0f} s to find", remedy="Choose a smaller area"
+                ) from None
 
 
 @router.post("/plots")

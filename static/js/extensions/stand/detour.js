@@ -4,7 +4,7 @@ import { get } from "../../core/api.js";
 import { button, byId } from "../../core/dom.js";
 import { count } from "../../core/format.js";
 import { attempted, showNews } from "../../core/problem.js";
-import { changed, on, state } from "../../core/store.js";
+import { changed, isDrive, on, state } from "../../core/store.js";
 import { colours } from "../../core/theme.js";
 import { drawText } from "../../map/draw.js";
 
@@ -18,13 +18,15 @@ function show(found) {
 
 export async function toggleDetour() {
   if (way) return show(null);
+  if (byId("map-coverage").disabled) return;
   const lacking = (state.map?.trees ?? []).filter(({ dbh_cm: dbh }) => dbh === null).length;
   if (!lacking) return showNews("Every tree of the map has a diameter");
   const pressed = byId("map-coverage");
   pressed.disabled = true;
+  const { source, remapped } = state;
   const found = await attempted(() => get("/api/detour"));
   pressed.disabled = false;
-  if (!found) return;
+  if (!found || source !== state.source || remapped !== state.remapped) return; // it is of another map
   if (!found.points) return showNews("No way through the observed area shows a tree without DBH from a missing side");
   show(found);
   showNews(`${textOf(found)} of ${lacking} without DBH`);
@@ -48,5 +50,6 @@ export function drawDetour(pen, view) {
 export function startDetour() {
   byId("map-png").before(button("map-coverage", "Coverage", "Show the way that shows trees without DBH from the sides that were never seen", toggleDetour));
   byId("map-coverage").setAttribute("aria-pressed", "false");
-  on("source", () => show(null)); // of another run
+  on("source remapped", () => show(null)); // of another map
+  on("phase map", () => { byId("map-coverage").hidden = !isDrive(); });
 }
