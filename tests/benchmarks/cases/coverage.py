@@ -44,7 +44,7 @@ class _Mapped(NamedTuple):
 
     Attributes:
         path: The estimated path.
-        trees: The confirmed trees.
+        trees: The confirmed trees, in the frame of the scene.
         seen: What its scans observed.
     """
 
@@ -156,6 +156,7 @@ def _map(run: SimulatedRun) -> _Mapped:
     from pipeline.config import preset
     from pipeline.detection.free_space import clear_range
     from pipeline.geometry.columns import rows_of
+    from pipeline.geometry.poses import Pose2
     from pipeline.io.readers.simulated import SimulatedSource
     from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import steps
@@ -170,4 +171,7 @@ def _map(run: SimulatedRun) -> _Mapped:
         if views.take(frame.estimate.T_map_base):
             seen.add(frame.stamp_ns, clear_range(frame.raw, frame.filtered, frame.sensor_offset))
     assert frame is not None
-    return _Mapped(mapper.path, rows_of(frame.trees, frame.trees.confirmed), seen)
+    trees, drive = rows_of(frame.trees, frame.trees.confirmed), run.motion.drive
+    T_world_map = Pose2(float(drive.x[0]), float(drive.y[0]), float(drive.yaw[0]))
+    placed = replace(trees, position=T_world_map.apply(trees.position))
+    return _Mapped(mapper.path, placed, seen)
