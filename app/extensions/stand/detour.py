@@ -35,7 +35,7 @@ MOST = 0.9
 STOP_COST = 2.0
 #: Length within which the next place is searched first [m]: three times the view.
 NEARBY = 25.0
-#: Radius of a stem without a diameter [m], for the clearance: 1 % of the stems of a stand are thicker.
+#: Radius of a stem without a diameter [m], for the clearance: that of a stem of 60 cm.
 UNKNOWN_RADIUS = 0.3
 
 
