@@ -79,12 +79,12 @@ def find_mounting(
     Raises:
         SourceError: The recording cannot be read.
     """
-    told = _mounting_by_frames(first.frame, odometry, extrinsics, options)
-    if told.T_base_lidar is not None:
-        return told
-    missing = f"no fixed transform from {first.frame or 'the LiDAR'} to {told.base or 'the base'}"
-    is_assumed = told.base != first.frame and odometry.is_known
-    motion, warnings = _Motion(mounting_by_ground(first.scan)), [*told.warnings]
+    by_frames = _mounting_by_frames(first.frame, odometry, extrinsics, options)
+    if by_frames.T_base_lidar is not None:
+        return by_frames
+    missing = f"no fixed transform from {first.frame or 'the LiDAR'} to {by_frames.base or 'the base'}"
+    is_assumed = by_frames.base != first.frame and odometry.is_known
+    motion, warnings = _Motion(mounting_by_ground(first.scan)), [*by_frames.warnings]
     if motion.T_base_lidar is not None:
         warnings.append(f"{missing}: {tilt_text(motion.T_base_lidar)}")
     if odometry.is_known and not live:
@@ -100,7 +100,7 @@ def find_mounting(
     if motion.T_base_lidar is None and is_assumed:
         warnings.append(f"{missing}: the LiDAR is assumed to be at the base")
     return replace(
-        told,
+        by_frames,
         T_base_lidar=motion.T_base_lidar,
         is_measured=motion.T_base_lidar is not None,
         is_assumed=is_assumed,
