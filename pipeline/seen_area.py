@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.geometry.directions import direction_bins
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.types.records import Bool, Float32, Int, Path
 
@@ -187,8 +188,6 @@ class SeenRecorder:
         Args:
             path: Final path; recorded scans whose stamps it does not have are left out.
         """
-        from pipeline.detection.free_space import directions  # the web process starts without Numba
-
         area = SeenArea(CELL, np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0, np.int64))
         cells: list[Int] = []
         distance: list[Float] = []
@@ -206,8 +205,7 @@ class SeenRecorder:
             place = grid + np.floor(np.array([pose.x, pose.y]) / CELL).astype(np.int64)
             local = pose.inverse().apply((place + 0.5) * CELL)
             reach = np.hypot(*local.T)
-            points = np.column_stack([local, np.zeros(len(local))]).astype(np.float32)
-            seen = (reach <= free[directions(points, np.zeros(3))] + INTO) & (reach <= RANGE)
+            seen = (reach <= free[direction_bins(local, len(free))] + INTO) & (reach <= RANGE)
             cells.append(place[seen])
             distance.append(reach[seen])
             rows += len(cells[-1])

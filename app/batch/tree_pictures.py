@@ -10,7 +10,8 @@ import numpy as np
 from app.common.draw_picture import Drawing, draw_safely
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.base import Source
-from pipeline.io.readers.camera import Camera, PictureSource, nearest
+from pipeline.io.readers.camera import PictureSource, nearest
+from pipeline.types.camera import Camera
 from pipeline.types.records import Bool, Float, Int, Path, Trees
 
 FOLDER = "pictures"

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from app.cli.flags import compilation_notice, progress_bar, refuse_to_overwrite, seed
 
 if TYPE_CHECKING:
-    from pipeline.io.readers.camera import Picture
     from pipeline.io.readers.simulated import SimulatedSource
+    from pipeline.types.camera import Picture
     from pipeline.types.records import Record
 
 HELP = "write a simulated run as an MCAP of ROS 2 messages, with its ground truth"

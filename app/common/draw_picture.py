@@ -18,7 +18,7 @@ from app.common.child_process import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.io.readers.camera import Picture
+    from pipeline.types.camera import Picture
 
 _COMMAND = python_module("app.common.draw_picture")
 _LINE_LIMIT = 2 << 20  # of a JPEG in base 64 [bytes]

@@ -17,7 +17,7 @@ from app.dashboard.payload import clusters_payload
 from app.dashboard.selection import NoStoryError, WorkerClient
 from app.worker.protocol import CameraPicture
 from pipeline.geometry.poses import Pose2, interpolate
-from pipeline.io.readers.camera import Camera
+from pipeline.types.camera import Camera
 from pipeline.types.records import Float, Frame, Path, Trees
 
 #: All browsers together get so many pictures a second at most.

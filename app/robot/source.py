@@ -29,9 +29,10 @@ from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.block_file import BlockFile
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions, count_loss
-from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
+from pipeline.io.readers.camera import SAME_TIME_NS
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
 from pipeline.io.recording.messages import map_messages, scan_messages
+from pipeline.types.camera import Camera, Picture
 from pipeline.types.records import Frame, Path, Record, Truth
 
 #: Motion between two stored pictures, which shows every tree from near, and limits of the disk space.

@@ -231,9 +231,8 @@ class TreeFeet:
                 return np.full(len(foot), frame.base_z)
             if known.all():
                 return foot
-            from scipy.spatial import cKDTree
-
-            nearest = cKDTree(trees.position[known]).query(trees.position[~known])[1]
+            others = trees.position[known]
+            nearest = [np.hypot(*(others - place).T).argmin() for place in trees.position[~known]]
             foot[~known] = foot[known][nearest]
         return foot
 
@@ -255,12 +254,9 @@ class TreeFeet:
 
     def _take(self, trees: Trees, points: NDArray[np.float32], *, clustered: bool) -> None:
         """Lower the feet to points in the map, shape (N, 3) [m], that are at most OWN_TREE from a tree."""
-        from scipy.spatial import cKDTree
-
-        distance, row = cKDTree(trees.position).query(points[:, :2], distance_upper_bound=OWN_TREE)
-        near = np.isfinite(distance)
+        row = nodes.nearest_within(trees.position, points[:, :2], OWN_TREE)
         low = np.full(len(trees.number), np.inf)
-        np.minimum.at(low, row[near], points[near, 2])
+        np.minimum.at(low, row[row >= 0], points[row >= 0, 2])
         for k in np.flatnonzero(np.isfinite(low)).tolist():
             number, z, (x, y) = int(trees.number[k]), float(low[k]), trees.position[k].tolist()
             _, before, was_clustered = self._lowest.get(number, _NO_FOOT)

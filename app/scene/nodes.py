@@ -528,3 +528,27 @@ def surface(grid: Float, low: Float, cell: float) -> tuple[NDArray[np.float32], 
     at = np.stack(np.nonzero(used), axis=1)
     vertices = np.column_stack([low + (at + 0.5) * cell, grid[used]])
     return vertices.astype(np.float32), faces.astype(np.uint32)
+
+
+def nearest_within(places: Float, points: NDArray[np.floating], reach: float) -> NDArray[np.int64]:
+    """Return the row of the place nearest to each point, shape (N,); -1 if none is within `reach` [m]. Each
+    place is compared with the points of its strip along y; a tree of SciPy would load SciPy into the web
+    process.
+
+    Args:
+        places: Positions x, y, shape (T, 2) [m].
+        points: Positions x, y, shape (N, 2) [m].
+        reach: Maximum distance [m].
+    """
+    order = np.argsort(points[:, 0], kind="stable")
+    ordered = points[order].astype(np.float64)
+    nearest, row = np.full(len(points), reach), np.full(len(points), -1)
+    strips = np.searchsorted(ordered[:, 0], places[:, :1] + np.array([-reach, reach]))
+    for k, (first, last) in enumerate(strips.tolist()):
+        distance = np.hypot(*(ordered[first:last] - places[k]).T)
+        is_nearer = distance < nearest[first:last]
+        row[first:last][is_nearer] = k
+        nearest[first:last][is_nearer] = distance[is_nearer]
+    rows = np.empty_like(row)
+    rows[order] = row
+    return rows

@@ -13,7 +13,6 @@ from app.scene import colours, nodes
 from app.scene.colours import Colours, ViewSettings
 from app.scene.nodes import MOST_LABELS, OWN_TREE, Batch, CloudNode, Float, Label, LabelNodes, Place, short
 from app.scene.robot import ROBOT
-from pipeline.evaluation import match
 from pipeline.types.records import Frame, Verdict
 
 Vector = tuple[float, float, float]
@@ -336,7 +335,8 @@ class ClusterNumbers:
 
     def follow(self, places: Float) -> Int:
         """Return a number for each cluster at these positions: that of the cluster of the previous call with
-        which it is paired within REACH (one to one, see `match`), else the next unused one, from 0 on.
+        which it is paired, else the next unused one, from 0 on. Two clusters are a pair if each is the
+        nearest one to the other, within REACH.
 
         Args:
             places: Positions of the clusters in the frame of the map, shape (K, 2) [m].
@@ -345,8 +345,11 @@ class ClusterNumbers:
             Different numbers, int64, shape (K,).
         """
         numbers = np.full(len(places), -1, dtype=np.int64)
-        before = match(places, self._places, REACH)
-        numbers[before >= 0] = self._numbers[before[before >= 0]]
+        before = nodes.nearest_within(self._places, places, REACH)
+        after = nodes.nearest_within(places, self._places, REACH)
+        mutual = np.flatnonzero(after >= 0)
+        mutual = mutual[before[after[mutual]] == mutual]
+        numbers[after[mutual]] = self._numbers[mutual]
         new = numbers < 0
         numbers[new] = self._next + np.arange(int(new.sum()))
         self._next += int(new.sum())

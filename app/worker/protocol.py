@@ -19,8 +19,8 @@ from app.explain.records import ClusterStory, MapSection, TreeStory
 from app.sources.one_step import OneStep
 from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
-from pipeline.io.readers.camera import Camera, Picture
 from pipeline.repairs.record import Repair
+from pipeline.types.camera import Camera, Picture
 from pipeline.types.records import Float, Frame, Int, Path, Trees, TruthTrees
 
 # Beyond any run, and well inside of an int64 of nanoseconds.

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.config.stages import Acquisition, Filters
 from pipeline.detection.free_space import BINS, directions, widest_gap
-from pipeline.geometry.azimuth_bins import bin_direction
+from pipeline.geometry.directions import bin_direction
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int32, Labels, Sensor, UInt16

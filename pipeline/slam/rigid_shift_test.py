@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.detection.free_space import BEHIND
-from pipeline.geometry.azimuth_bins import direction_bins
+from pipeline.geometry.directions import direction_bins
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import OdometryTrust, inverted

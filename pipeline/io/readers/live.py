@@ -21,15 +21,7 @@ from pipeline.io.readers.base import (
     count_loss,
     digest_of,
 )
-from pipeline.io.readers.camera import (
-    SAME_TIME_NS,
-    Camera,
-    MessageSource,
-    Picture,
-    find_camera,
-    picture_of,
-    time_beside,
-)
+from pipeline.io.readers.camera import SAME_TIME_NS, MessageSource, find_camera, picture_of, time_beside
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import header_stamp
 from pipeline.io.readers.ouster import with_packets_decoded
@@ -38,6 +30,7 @@ from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
 from pipeline.io.readers.ros_first_scans import EmptyScansError
 from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed, standard_types
 from pipeline.io.readers.transforms import Extrinsics, TransformTree
+from pipeline.types.camera import Camera, Picture
 from pipeline.types.records import Notice, Record
 from pipeline.types.units import SECOND_NS
 

@@ -20,12 +20,12 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.ground_truth import ATTACHMENT, truth_json
-from pipeline.io.readers.camera import Camera, Picture
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import NAME, PARAMETERS, SKIPPED, VERSION
 from pipeline.io.readers.mcap_file import NOT_FINISHED, McapFile
 from pipeline.io.readers.topics import is_fixed
 from pipeline.io.recording import messages
+from pipeline.types.camera import Camera, Picture
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor, Truth
 
 CHUNK_SIZE = 1 << 20

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.camera import Camera, Picture
+from pipeline.types.camera import Camera, Picture
 from pipeline.types.records import Record, Scan, TruthPath, TruthTrees
 
 TOPIC = "/camera/image/compressed"

@@ -27,7 +27,7 @@ from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
 from pipeline.io.block_file import SPARE_BYTES
 from pipeline.io.readers import SourceOptions, open_source
-from pipeline.io.readers.camera import SHOWN_NS, Picture
+from pipeline.io.readers.camera import SHOWN_NS
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.live import LiveRecording
 from pipeline.io.readers.mcap_file import McapFile
@@ -36,6 +36,7 @@ from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.io.readers.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.io.recording.rendering import CAMERA, with_pictures
+from pipeline.types.camera import Picture
 from pipeline.types.records import Path as Way
 from pipeline.types.records import Record, Scan, Truth
 from tests.app.batch.test_tree_pictures import trees_at

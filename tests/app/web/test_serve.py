@@ -24,6 +24,8 @@ from app.cli import main
 from app.common.settings import Settings
 from app.web.serving import bind
 from pipeline.errors import StemmapError
+from pipeline.io.readers import open_source
+from pipeline.io.recording.mcap_writer import write_recording
 
 ROOT = Path(__file__).resolve().parents[3]
 LINK = re.compile(r"stemmap is ready: (http://127\.0\.0\.1:(\d+)/)\?token=(\S+)")
@@ -132,6 +134,17 @@ async def test_a_whole_session_over_sockets() -> None:
         await client.post("/api/open", json={"uri": "sim:paper", "seed": 2})
         await page.until("status", lambda s: s["source"] == "sim:paper" and s["state"] == "playing")
         await page.passed(2)
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="the system does not list loaded libraries")
+async def test_the_web_process_shows_a_recording_without_numerical_libraries(tmp_path: Path) -> None:
+    recording, source = tmp_path / "drive.mcap", open_source("sim:stand?duration=6")
+    known = source.description
+    write_recording(recording, source.records(), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
+    async with serving(str(recording)) as server, server.browser() as (_, page):
+        await page.until("map", lambda shown: len(shown["trees"]) > 3)
+        loaded = Path(f"/proc/{server.process.pid}/maps").read_text(encoding="utf-8")
+        assert not [name for name in ("llvmlite", "scipy", "sklearn", "open3d") if f"/{name}/" in loaded]
 
 
 async def test_a_killed_worker_is_replaced_under_the_page() -> None:

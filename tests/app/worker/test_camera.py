@@ -28,11 +28,12 @@ from app.worker.session import camera_picture, has_camera, tree_picture
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import open_source
-from pipeline.io.readers.camera import SHOWN_NS, Picture
+from pipeline.io.readers.camera import SHOWN_NS
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.io.recording.rendering import CAMERA, rendered, with_pictures
+from pipeline.types.camera import Picture
 from pipeline.types.records import Frame, Truth, TruthTrees
 from tests.app.batch.test_tree_pictures import bomb, trees_at
 from tests.app.fakes import FakeWorker, frame, opened, path

@@ -12,7 +12,8 @@ from pipeline.config import preset
 from pipeline.detection.free_space import BINS
 from pipeline.detection.truncation import field_of_view
 from pipeline.front_end import detect, segment
-from pipeline.geometry.azimuth_bins import bin_direction, direction_bin
+from pipeline.geometry.azimuth_bins import direction_bin
+from pipeline.geometry.directions import bin_direction
 from pipeline.geometry.poses import Pose3
 from pipeline.types.records import Scan, Sensor, Step, Verdict
 

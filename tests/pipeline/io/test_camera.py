@@ -15,6 +15,7 @@ from pipeline.io.readers.camera import PIXEL_LIMIT, find_camera, picture_of
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.topics import CAMERA_INFO, IMAGE, standard_types
 from pipeline.io.readers.transforms import TransformTree
+from pipeline.types.camera import Camera
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 T_BASE_CAMERA = Pose3(np.eye(3), np.array([0.3, 0.0, 1.0]))
@@ -52,7 +53,7 @@ class Recorded(Container):
         return (Message(1, k, payload) for k, payload in enumerate(self._payloads) if 1 in numbers)
 
 
-def found_camera(*payloads: bytes) -> tuple[camera_module.Camera | None, str]:
+def found_camera(*payloads: bytes) -> tuple[Camera | None, str]:
     """The camera by these messages, which is mounted at T_BASE_CAMERA."""
     tree = TransformTree()
     tree.add("base", "camera", T_BASE_CAMERA)

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
-from pipeline.geometry.azimuth_bins import bin_direction
+from pipeline.geometry.directions import bin_direction
 from pipeline.geometry.poses import Pose2
 from pipeline.slam import FastSlam
 from pipeline.slam.slip_detection import UNSURE

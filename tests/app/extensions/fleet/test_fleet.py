@@ -18,7 +18,8 @@ from websockets.exceptions import InvalidStatus
 import app.extensions.fleet.fleet as fleet_module
 from app.common.settings import Settings
 from app.dashboard.run_recorder import _Page
-from app.extensions.fleet.fleet import Fleet, Frames, build_fleet, named, warm_kernels
+from app.extensions.fleet.fleet import Fleet, Frames, build_fleet, warm_kernels
+from app.extensions.fleet.members import named
 from app.sources.request import SourceRequest
 from app.store.records import NewRun
 from app.web.auth import AccessTokens, viewer_token

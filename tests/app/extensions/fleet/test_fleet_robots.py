@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from app.extensions.fleet.fleet import RobotWatch, robots_at, watched_router
+from app.extensions.fleet.fleet import RobotWatch
+from app.extensions.fleet.members import robots_at, watched_router
 from app.sources.live_address import ZenohAddress, parse_address
 from app.worker.protocol import Open
 from tests.app.extensions.fleet.test_fleet import make

@@ -6,7 +6,8 @@ import asyncio
 
 import pytest
 
-from app.extensions.fleet.fleet import NAMELESS, RobotWatch, address_of, recorded_apart
+from app.extensions.fleet.fleet import RobotWatch
+from app.extensions.fleet.members import NAMELESS, address_of, recorded_apart
 from app.robot.topics import Publisher, choose
 from app.sources.live_address import ROOT, ZenohAddress, parse_address
 from app.worker.protocol import Open
