@@ -258,15 +258,20 @@ def unconfirmed_warning(frame: Frame, parameters: Parameters) -> str:
 LEFT_OUT = 0.1  # share of the scans above which their loss makes the map doubtful
 
 
+def scans_left_out(losses: Mapping[str, int]) -> dict[str, int]:
+    """Return the losses of whole scans, whose reasons begin with "scans"; others, such as poses or times of
+    points, are of scans that are mapped without them."""
+    return {reason: n for reason, n in losses.items() if reason.startswith("scans")}
+
+
 def left_out_warning(losses: Mapping[str, int], scans: int) -> str:
     """Return a warning if more than LEFT_OUT of the scans of a run were left out; else "".
 
     Args:
-        losses: Dict from reasons to numbers of records that were left out; those of whole scans begin with
-            "scans", others do not, such as poses or times of points of scans that are mapped without them.
+        losses: Dict from reasons to numbers of records that were left out, see `scans_left_out`.
         scans: Number of mapped scans.
     """
-    left_out = {reason: n for reason, n in losses.items() if reason.startswith("scans")}
+    left_out = scans_left_out(losses)
     lost = sum(left_out.values())
     if lost <= LEFT_OUT * (lost + scans):
         return ""

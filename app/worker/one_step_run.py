@@ -61,6 +61,11 @@ class OneStepRun:
         """Share of the map under way that is done, from 0 to 1; None if none is computed."""
         return None if self._job is None else self._share
 
+    @property
+    def losses(self) -> dict[str, int]:
+        """Dict from a reason to the number of points that were left out for it."""
+        return self.source.losses
+
     def counts(self, index: int) -> RunCounts:
         """Return the counts of the present map; empty before it is complete."""
         del index

@@ -48,6 +48,7 @@ class Status:
         scan_rate_hz, mapping_ms: Rate [Hz] and mapping time [ms], measured over the last scans.
         stage_ms: Dict from stages to median times over the last scans [ms].
         scans_behind: Number of scans that wait to be mapped.
+        scans_left_out: Number of scans that were lost or skipped, or that the reader refused.
         trees: Number of confirmed trees.
         distance_m: Driven distance [m].
         health: Pose quality "good", "weak" or "lost", or why it is too early to know (see `health_word`).
@@ -84,6 +85,7 @@ class Status:
     mapping_ms: float = 0.0
     stage_ms: dict[str, float] = field(default_factory=dict)
     scans_behind: int = 0
+    scans_left_out: int = 0
     trees: int = 0
     distance_m: float = 0.0
     health: str = "no scan yet"

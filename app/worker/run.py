@@ -128,8 +128,12 @@ class Run:
     def counts(self, index: int) -> RunCounts:
         """Return the counts of the map up to a scan that was mapped. Only `losses` is not limited to that
         scan: it has all that was left out so far while the source was read."""
-        losses = Counter(self._left_out) + Counter(self.source.losses)
-        return self._map.counts.totals(index, self.warnings, losses)
+        return self._map.counts.totals(index, self.warnings, self.losses)
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """New dict from a reason to the number of records that were left out for it so far."""
+        return dict(Counter(self._left_out) + Counter(self.source.losses))
 
     @property
     def odometry_xy(self) -> Float:

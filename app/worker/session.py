@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from app.batch.summary import driven, health_word
+from app.batch.summary import driven, health_word, scans_left_out
 from app.batch.tree_pictures import best_views
 from app.explain import build as stories
 from app.robot.recorder import Recorder
@@ -685,6 +685,7 @@ def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | Non
         scans=description.scans,
         mapping_ms=round(run.stopwatch.scan_ms, 3),
         stage_ms={stage: round(ms, 3) for stage, ms in run.stopwatch.stage_ms.items()},
+        scans_left_out=sum(scans_left_out(run.losses).values()),
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
         distance_m=distance_m,
         health=health_word(frame, distance_m),

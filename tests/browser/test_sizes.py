@@ -23,15 +23,46 @@ CUT = """() => {
   return shown.filter(node => node.getBoundingClientRect().right > edge + 1).map(node => node.dataset.figure);
 }"""
 
+# What is wider than the drawer.
+WIDER = """() => [...document.querySelectorAll('#side *')].filter(node =>
+  node.offsetWidth > 0 && !node.closest('.scroll')
+  && node.getBoundingClientRect().right > document.querySelector('#side').getBoundingClientRect().right + 1
+).map(node => `${node.tagName}#${node.id}`)"""
+
+# A live run with the longest figures that are usual, or as it begins.
+LIVE = """async busy => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const figures = busy ? { recording: 'recording run.mcap, 1234.5 MB', health: 'lost', trees: 1234,
+    scan_rate_hz: 10, scans_behind: 123, scans_left_out: 1234, mapping_ms: 141.2, distance_m: 12345.6 }
+    : { recording: '', health: 'good', trees: 0, scan_rate_hz: 0, scans_behind: 0, scans_left_out: 0,
+    mapping_ms: 0, distance_m: 0 };
+  state.status = { ...state.status, state: busy ? 'playing' : 'waiting', live: true, robot: 'forwarder-07',
+    robots: [], ...figures };
+  state.evaluation = null;
+  changed('status');
+}"""
+
+# Places of the figures in the strip with its height, those that are shown whole, and those whose text is cut.
+STRIP = """() => {
+  const list = document.querySelector('.figures'), edge = list.getBoundingClientRect();
+  const cells = [...list.children].filter(node => node.offsetWidth > 0);
+  const shown = cells.filter(node => node.getBoundingClientRect().top < edge.bottom - 1);
+  const places = shown.map(node => [node.dataset.figure, node.getBoundingClientRect().left]);
+  const isCut = node => [node, ...node.querySelectorAll('dd, dt')].some(part =>
+    part.scrollWidth > part.clientWidth + 1 || part.scrollHeight > part.clientHeight + 1);
+  return [[document.querySelector('.strip').getBoundingClientRect().height, ...places],
+    shown.filter(isCut).map(node => node.dataset.figure)];
+}"""
+
 
 # What stands side by side in the strip may not lie upon one another.
 OVERLAPS = """() => {
-  const parts = [...document.querySelectorAll('.strip > *, .strip-end > *, #state b')].filter(node =>
-    node.offsetWidth > 0 && !node.matches('.strip-end, #state'));
+  const parts = [...document.querySelectorAll('.strip > *, .strip-end > *, #state b, #recording')];
+  const shown = parts.filter(node => node.offsetWidth > 0 && !node.matches('.strip-end, .run-state'));
   const box = node => node.getBoundingClientRect();
   const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1
     && a.top < b.bottom - 1 && b.top < a.bottom - 1;
-  return parts.flatMap((a, k) => parts.slice(k + 1).filter(b => meet(box(a), box(b)))
+  return shown.flatMap((a, k) => shown.slice(k + 1).filter(b => meet(box(a), box(b)))
     .map(b => `${a.id || a.tagName} and ${b.id || b.tagName}`));
 }"""
 
@@ -59,6 +90,28 @@ def test_nothing_overflows_the_page(chromium: Browser, server: Server, size: tup
                 check_map_stays(dashboard)
             if other[0] == 1024:
                 check_drawer(dashboard)
+
+
+def test_the_strip_of_a_live_run_is_whole_and_nothing_in_it_moves(mapped: Dashboard):
+    page = mapped.page
+    for width, height in ((1440, 900), (1280, 720), (1024, 768), (820, 1180), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        mapped.drawn()
+        places = []
+        for busy in (False, True):
+            page.evaluate(LIVE, busy)
+            place, cut = page.evaluate(STRIP)
+            assert cut == [], width
+            assert page.evaluate(SPILLS) == [], width
+            assert page.evaluate(OVERLAPS) == [], width
+            places.append(place)
+        assert places[0] == places[1], width
+        if width == 1440:
+            shown = {name for name, _ in places[1][1:]}
+            assert shown == {"trees", "health", "driven", "behind", "mapping", "rate", "sigma"}
+            expect(page.locator("[data-figure=behind] dt")).to_have_text("behind, 1234 left out")
+        if width == 390:
+            assert places[1][0] < 0.15 * height
 
 
 def check(dashboard: Dashboard, size: tuple[int, int]) -> None:
@@ -89,10 +142,9 @@ def check_map_stays(dashboard: Dashboard) -> None:
 
 def check_drawer(dashboard: Dashboard) -> None:
     side = dashboard.page.locator("#side")
-    expect(side).not_to_be_visible()
-    dashboard.page.locator("#drawer-button").click()
-    expect(side).to_be_visible()
+    expect(side).to_be_visible()  # a tablet begins with the map
     assert dashboard.page.evaluate(SPILLS) == []
+    assert dashboard.page.evaluate(WIDER) == []
     dashboard.page.locator("#drawer-button").click()
     expect(side).not_to_be_visible()
 

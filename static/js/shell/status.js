@@ -18,18 +18,18 @@ const TESTED = ["good", "weak", "lost"]; // the pose was tested by trees; else i
 const OLD_AFTER = 3000; // [ms] without a message while a run plays
 const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans take longer
 
-// title, unit, function of the status that returns [text, class, title, unit], all but the text may be left out, and "minor" if it
-// is hidden first in a narrow strip
+// title, unit, function of the status that returns [text, class, title, unit], all but the text may be left out; in the order in
+// which they have the room of a narrow strip
 const FIGURES = {
   trees: ["trees", "", (s) => [String(s.trees - rejected()), ...labelOfTrees(s)]],
   points: ["points", "", (s) => [s.one_step ? s.one_step.points.toLocaleString("en") : NONE]],
   health: ["SLAM", "", (s) => health(s)],
-  rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
-  mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
-  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
-  driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  sigma: ["pose sigma", "", (s) => (state.map && TESTED.includes(s.health) ? sigma(state.map.sigma_xy) : [NONE]), "minor"],
   f1: ["F1 of the map", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
+  driven: ["driven", "m", (s) => [figure(s.distance_m)]],
+  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 || s.scans_left_out ? "warn" : "", s.scans_left_out ? `behind, ${s.scans_left_out} left out` : "scans behind"]],
+  mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`]],
+  rate: ["scans mapped", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE]],
+  sigma: ["pose sigma", "", (s) => (state.map && TESTED.includes(s.health) ? sigma(state.map.sigma_xy) : [NONE])],
 };
 const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
 const cells = {};
@@ -86,11 +86,11 @@ function healthFigures() {
 
 function build() {
   const list = byId("figures");
-  for (const [name, [title, unit, , rank]] of Object.entries(FIGURES)) {
+  for (const [name, [title, unit]] of Object.entries(FIGURES)) {
     const value = el("span", { text: NONE }), small = el("small", { text: unit });
     const label = el("dt", { text: title });
-    const cell = el("div", { class: rank ?? "", "data-figure": name }, label, el("dd", {}, value, small));
-    cells[name] = { cell, value, label, title, rank: rank ?? "", small, unit };
+    const cell = el("div", { "data-figure": name }, label, el("dd", {}, value, small));
+    cells[name] = { cell, value, label, title, small, unit };
     list.append(cell);
   }
 }
@@ -103,7 +103,7 @@ function show() {
     setText(cells[name].value, text);
     setText(cells[name].label, title ?? cells[name].title);
     setText(cells[name].small, unit ?? cells[name].unit);
-    cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
+    cells[name].cell.className = meaning ?? "";
   }
   for (const name of OF_DRIVES) cells[name].cell.hidden = !isDrive();
   cells.rate.cell.hidden ||= status.state === "finished";
@@ -111,6 +111,8 @@ function show() {
   document.body.classList.toggle("one-step", !isDrive());
   cells.health.cell.title = healthFigures();
   cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has the times of the run.";
+  cells.rate.cell.title = "Scans that were mapped in a second, over the last 20 of them";
+  cells.behind.cell.title = "Scans that wait to be mapped. Scans that were lost or skipped are left out of the map; Scores lists why";
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);

@@ -51,6 +51,6 @@ export function startDrawer() {
     button.setAttribute("aria-expanded", String(open));
     remember("drawer", open ? "open" : "closed");
   };
-  show(recall("drawer") === "open");
+  show(recall("drawer") !== "closed");
   button.addEventListener("click", () => show(!side.classList.contains("open")));
 }

@@ -498,6 +498,15 @@ def test_status_tells_the_figures_of_the_run() -> None:
     assert session.next_ns() == scan(3).stamp_ns
 
 
+def test_status_counts_the_scans_that_are_left_out() -> None:
+    source = FakeSource(SCANS)
+    session = make_session(source)
+    session.open(Open("fake:"))
+    assert session.status().scans_left_out == 0
+    source.losses = {"scans lost on the network": 3, "scans without points": 2, "poses without a frame": 7}
+    assert session.status().scans_left_out == 5
+
+
 @pytest.mark.parametrize(("waiting", "state"), [(0, "waiting"), (3, "playing")])
 def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str) -> None:
     robot = SimpleNamespace(
