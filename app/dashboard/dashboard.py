@@ -369,7 +369,7 @@ class Dashboard:
         if number != self._opens:  # another source was requested meanwhile
             return
         await self._forget()
-        if self.parameters.suit(opened.preset):
+        if self.parameters.suit(opened.preset, self.digest):
             self._show_parameters()
         restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
         self.run_recorder.begin(self.annotation_editor.run, self.source, opened, again=restarted)

@@ -74,6 +74,7 @@ class ParameterState:
         self.check: Callable[[Parameters], None] = lambda _: None
         self.suits = self.preset
         self._suited = _Standing(self.preset, self.parameters)
+        self._source = ""
         self._undo: list[_Standing] = []
         self._redo: list[_Standing] = []
         self._gesture = _NO_GESTURE
@@ -162,12 +163,24 @@ class ParameterState:
         name = preset_name if preset_name in PRESETS else self.preset
         self._become(name, preset(name).replace(values))
 
-    def suit(self, name: str) -> bool:
+    def suit(self, name: str, source: str = "") -> bool:
         """Use the preset that suits a source, unless a person has chosen the values in force or the preset
         cannot be used. Return whether `as_plain` differs now. It is no undo step; after an undo or a reset of
-        all changes nothing counts as chosen."""
-        is_other, self.suits = name != self.suits, name
-        if self._suited != (self.preset, self.parameters):
+        all changes nothing counts as chosen. Of the steps of another source only those that lead back from
+        the values in force stay.
+
+        Args:
+            name: The preset.
+            source: Identifies the source.
+        """
+        is_other, self.suits = name != self.suits or source != self._source, name
+        is_chosen = self._suited != (self.preset, self.parameters)
+        if source != self._source:
+            self._source = source
+            self._redo.clear()
+            if not is_chosen:
+                self._undo.clear()
+        if is_chosen:
             return is_other
         try:
             preset_name, parameters = self._begin(name)

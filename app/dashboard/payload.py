@@ -29,8 +29,8 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
     The keys are `type`, "map"; `index` and `time_s` of the scan [s since the first scan]; `pose` and `odom`,
     lists [x [m], y [m], yaw [rad]] of `T_map_base` and `T_odom_base`; `sigma_xy`, the root mean square of the
     standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; `health`, `trees`, `clusters`,
-    `layers` and `clearance`, the results of the functions of this module; `loops`, pairs of scans, and
-    `problems`, as in `Shown`; and the keys of `counts_of`.
+    `layers` and `clearance`, the results of the functions of this module; `loops`, pairs of scans,
+    `problems` and `repaired_numbers`, as in `Shown`; and the keys of `counts_of`.
 
     Args:
         shown: The scan with the map.
@@ -55,6 +55,7 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         "clearance": clearance_payload(frame.clearance),
         "loops": shown.loops.tolist(),
         "problems": list(shown.problems),
+        "repaired_numbers": [list(numbers) for numbers in shown.repaired_numbers],
     }
 
 

@@ -426,6 +426,7 @@ class WorkerLoop:
                     () if repaired is None else repaired.problems,
                     session.loops,
                     () if repaired is None else session.repairs,
+                    () if repaired is None else repaired.numbers,
                 )
             )
 

@@ -250,6 +250,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         problems: Why each of the repairs of `SetRepairs` does not apply; "" if it does.
         loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
         repairs: The repairs to which `problems` belongs.
+        repaired_numbers: Numbers of the trees that each of them is about, see `RepairedMap`.
     """
 
     run: int
@@ -263,6 +264,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     problems: tuple[str, ...] = ()
     loops: Int = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
     repairs: tuple[Repair, ...] = ()
+    repaired_numbers: tuple[tuple[int, ...], ...] = ()
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):

@@ -153,7 +153,8 @@ class Session:
                 self._faults[fault] = None
                 traceback.print_exc(file=sys.stderr)
             problems = (fault,) * len(self._repairs)
-            found = RepairedMap(shown.frame, shown.path, problems, loops_of(graph), None)
+            numbers = ((),) * len(problems)
+            found = RepairedMap(shown.frame, shown.path, problems, numbers, loops_of(graph), None)
         self._repaired = (shown.frame, hurried, found)
         return found
 

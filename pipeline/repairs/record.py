@@ -166,6 +166,17 @@ def seen_from(trees: Trees, path: Path, place: tuple[float, float]) -> tuple[int
     return int(path.stamp_ns[scan]), (x, y)
 
 
+def tied_numbers(trees: Trees, path: Path, repair: Repair) -> tuple[int, ...]:
+    """Return the numbers of the trees of a map that a "tie" makes one; those not in the map are left out."""
+    rows = list[int | None]()
+    for stamp, place in zip(repair.stamps_ns, repair.places, strict=False):  # "forbid" has no places
+        scan = min(int(np.searchsorted(path.stamp_ns, stamp)), len(path.x) - 1)
+        pose = Pose2(float(path.x[scan]), float(path.y[scan]), float(path.yaw[scan]))
+        x, y = pose.apply(np.array(place)).tolist()
+        rows.append(nearest_tree(trees, (x, y), confirmed=True))
+    return tuple(int(trees.number[row]) for row in rows if row is not None)
+
+
 def nearest_tree(trees: Trees, place: tuple[float, float], *, confirmed: bool) -> int | None:
     """Return the row of the tree that is nearest to a position among those that are confirmed, or among the
     others; None if none is within GATE."""

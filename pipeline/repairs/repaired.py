@@ -11,8 +11,8 @@ from pipeline.geometry.columns import rows_of
 from pipeline.geometry.pose_arrays import PathCorrection, rotated_rows
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.repairs.loops import LoopRepair, corrected_from, with_loops
-from pipeline.repairs.record import Repair
-from pipeline.repairs.trees import FIRST_ADDED, merged_trees, repaired_trees
+from pipeline.repairs.record import Repair, tied_numbers
+from pipeline.repairs.trees import FIRST_ADDED, merged_trees, numbers_of, repaired_trees
 from pipeline.slam.keyframe_graph import TWICE, KeyframeGraph
 from pipeline.types.records import Bool, Columns, Frame, HeightMap, Int, Path, PoseEstimate, Trees
 
@@ -48,6 +48,8 @@ class RepairedMap:
     Attributes:
         frame, path: As in `MapOfRun`, repaired.
         problems: Why each repair does not apply; "" if it does.
+        numbers: Numbers of the trees that each repair is about, in the order of its positions: of trees of
+            the map before it, and of "tie" before all repairs. Trees that are not found are left out.
         loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
         correction: Correction of the path; None if it is unchanged.
     """
@@ -55,6 +57,7 @@ class RepairedMap:
     frame: Frame
     path: Path
     problems: tuple[str, ...]
+    numbers: tuple[tuple[int, ...], ...]
     loops: Int
     correction: PathCorrection | None
 
@@ -92,14 +95,18 @@ class Repairer:
                 x, y, yaw = (column.copy() for column in correction.after.T)
                 path = Path(path.stamp_ns, x, y, yaw, path.sigma_xy)
                 frame = _moved_frame(frame, _moved_trees(run, correction), correction)
-        problems, trees = list[str](), frame.trees
+        problems, numbers, trees = list[str](), list[tuple[int, ...]](), frame.trees
         for number, repair in enumerate(repairs):
             if repair.is_of_loop:
                 problems.append(next(of_loop))
+                numbers.append(tied_numbers(run.frame.trees, run.path, repair))
             else:
+                numbers.append(numbers_of(trees, repair))
                 trees, problem = repaired_trees(trees, repair, FIRST_ADDED + number)
                 problems.append(problem)
-        return RepairedMap(replace(frame, trees=trees), path, tuple(problems), loops, correction)
+        return RepairedMap(
+            replace(frame, trees=trees), path, tuple(problems), tuple(numbers), loops, correction
+        )
 
     def _loops(self, run: MapOfRun, repairs: tuple[Repair, ...], *, hurried: bool) -> tuple[LoopRepair, Path]:
         """Return the repair of the loops and the path before it, which may be that of an earlier scan."""

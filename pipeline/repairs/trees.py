@@ -54,6 +54,13 @@ def repaired_trees(trees: Trees, repair: Repair, added: int) -> tuple[Trees, str
             return rows_of(trees, np.delete(np.arange(len(trees.number)), row)), ""
 
 
+def numbers_of(trees: Trees, repair: Repair) -> tuple[int, ...]:
+    """Return the numbers of the trees that a repair of trees is about; those not in the map are left out."""
+    places = repair.places if repair.kind == "merge" else repair.places[:1]
+    rows = [nearest_tree(trees, place, confirmed=repair.value != "tree") for place in places]
+    return tuple(int(trees.number[row]) for row in rows if row is not None)
+
+
 def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:
     """Return the trees without the rows `others`, each merged into a row of `into`, shape (M,); no row is in
     both, or twice.

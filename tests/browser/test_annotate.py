@@ -29,6 +29,24 @@ def person(chromium: Browser, server: Server) -> Iterator[Dashboard]:
         yield dashboard
 
 
+# Two edits of which the second one waits while another run is opened.
+OTHER_RUN = """async () => {
+  const [{ edit, draft }, { state }] = await Promise.all([
+    import('/static/js/annotate/annotations.js'), import('/static/js/core/store.js'),
+  ]);
+  const made = [], { annotations } = state;
+  const first = edit(async () => {
+    made.push(1);
+    state.annotations = { ...annotations, run: annotations.run + 1 };
+    return { undo: 0, redo: 0, serial: 0 };
+  });
+  const second = edit(async () => { made.push(2); return { undo: 0, redo: 0, serial: 0 }; });
+  await Promise.all([first, second]);
+  state.annotations = annotations;
+  return { made, error: draft.error };
+}"""
+
+
 def rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = dashboard.ask("/api/annotations")["trees"]
     return found
@@ -201,6 +219,58 @@ def test_quick_answers_belong_to_the_tree_on_the_card(person: Dashboard):
     person.until_server("/api/annotations", f"it.trees.length + it.skipped.length === {number - 1}")
     expect(last).to_be_hidden()
     assert person.errors == []
+
+
+def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard):
+    page = person.page
+    canvas = page.locator("#map")
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    first, second, third = (tree["number"] for tree in doubted(person)[:3])
+    history, title = page.locator("#review-history"), page.locator("#review-title")
+    expect(history).to_be_hidden()
+    canvas.press("s")
+    for key, number in zip("yph", (first, second, third), strict=True):
+        expect(title).to_have_text(f"Tree {number}")
+        person.answer(key)
+    expect(history.get_by_role("button")).to_have_text(
+        ["Previous (R)", f"{third} person", f"{second} pole", f"{first} tree"]
+    )
+    person.card_shown()
+    canvas.press("r")
+    expect(title).to_have_text(f"Tree {third}")
+    canvas.press("r")
+    expect(title).to_have_text(f"Tree {second}")
+    expect(page.locator("#review-state")).to_have_text("rejected")
+    page.locator("#review-story").click()
+    expect(page.locator("#panel-story [data-rejected=pole]")).to_contain_text("rejected this tree")
+    person.tab("Annotate")
+    person.answer("b")
+    expect(history.get_by_role("button").nth(1)).to_have_text(f"{second} bush")
+    history.get_by_role("button", name=f"{first} tree").click()
+    expect(title).to_have_text(f"Tree {first}")
+    assert person.errors == []
+
+
+def test_edits_that_wait_while_another_run_is_opened_are_not_made_in_it(person: Dashboard):
+    told = person.page.evaluate(OTHER_RUN)
+    assert told == {"made": [1], "error": "Another run was opened meanwhile: this edit belongs to the one "
+                    "before and was not made."}  # fmt: skip
+
+
+def test_the_name_is_asked_until_it_is_given_and_stored_with_answers(person: Dashboard):
+    page = person.page
+    ask = page.locator("#annotate-ask")
+    expect(ask).to_be_visible()
+    page.locator("#annotate-asked").fill("Ann")
+    page.locator("#annotate-asked").press("Enter")
+    expect(ask).to_be_hidden()
+    expect(page.locator("#annotate-name")).to_have_value("Ann")
+    page.locator("#map").press("s")
+    person.answer("y")
+    person.until_server("/api/annotations", "it.trees.length === 1 && it.trees[0].who === 'Ann'")
+    page.reload()
+    person.until("() => document.querySelector('#annotate-name')?.value === 'Ann'")
+    expect(ask).to_be_hidden()
 
 
 def test_keys_work_after_a_click_on_next(person: Dashboard):

@@ -94,6 +94,15 @@ def test_each_repair_changes_the_map_and_is_undone_and_redone(person: Dashboard)
     person.until_server("/api/trees", f"!it.trees.some(tree => tree.number === {f['number']})")
     expect(listed).to_have_count(5)
     expect(page.locator("#repair-count")).to_have_text("5 repairs")
+    expect(listed.locator(".grow")).to_have_text(
+        [
+            f"tree {f['number']} deleted",
+            f"tree {e['number']} is a pole",
+            f"tree {d['number']} moved",
+            f"tree {c['number']} split",
+            f"tree {b['number']} merged into tree {a['number']}",
+        ]
+    )
     mended = trees(person)
 
     # The export has the repaired map and says so; another scan has it too.
@@ -134,7 +143,9 @@ def test_a_tie_bends_the_path_and_is_forbidden_and_undone(person: Dashboard):
     person.eventually(
         lambda: page.evaluate(loops) == known + 1, lambda: page.locator("#repairs").inner_text()
     )
-    expect(page.locator("#repairs li")).to_contain_text("same place")
+    expect(page.locator("#repairs li")).to_contain_text(
+        f"same place: trees {first['number']} and {last['number']}"
+    )
     assert page.evaluate(end) != before
     page.locator("#map").press("Control+z")
     person.eventually(lambda: page.evaluate(end) == before, lambda: page.evaluate(end))

@@ -19,11 +19,12 @@ from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
 from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
 from pipeline.errors import SourceError
+from pipeline.repairs.record import nearest_tree
 
 router = APIRouter(prefix="/api")
 
 _LARGEST_DBH_M = 10.0
-_Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited")
+_Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
 
 
 class _Add(Edit):
@@ -141,7 +142,8 @@ async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
 @router.get("/annotations.csv")
 async def export_table(dashboard: Dash) -> Response:
     """Return the annotations as a CSV table for the import and for `stemmap evaluate`, those of a run of one
-    step in the coordinates of its file; only the header without annotations."""
+    step in the coordinates of its file; `tree` is the number of the tree of the map that each is about. Only
+    the header without annotations."""
     from pipeline.io.result_files import csv_text
 
     return text_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
@@ -150,8 +152,8 @@ async def export_table(dashboard: Dash) -> Response:
 @router.get("/annotations.geojson")
 async def export_geojson(dashboard: Dash) -> Response:
     """Return the annotations as a FeatureCollection of points in the frame of the map, or of the file of a
-    run of one step, which it declares, with class, DBH [cm], author and time; no features without
-    annotations."""
+    run of one step, which it declares, with class, DBH [cm], author, time and number of the tree in
+    the map; no features without annotations."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
     frame = dict(ROBOTS_FRAME)
@@ -167,17 +169,33 @@ async def export_geojson(dashboard: Dash) -> Response:
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
-    """Return the annotations of objects of the open run as dicts, see `row_payload`; for a run of one
-    step, in the coordinates of its file."""
+    """Return the annotations of objects of the open run as dicts, see `row_payload`, with `tree`, the number
+    of the nearest tree of the map within half a metre, None for none; for a run of one step, in the
+    coordinates of its file."""
     x, y = dashboard.offset
     rows = [row_payload(row) for row in dashboard.annotation_editor.rows]
-    return [{**row, "x": row["x"] + x, "y": row["y"] + y} for row in rows]
+    return [
+        {**row, "x": row["x"] + x, "y": row["y"] + y, "tree": _tree_at(dashboard, row["x"], row["y"])}
+        for row in rows
+    ]
+
+
+def _tree_at(dashboard: Dashboard, x: float, y: float) -> int | None:
+    """Return the number of the tree of the map that an annotation at x, y [m] is about, None for none."""
+    if dashboard.shown is None:
+        return None
+    trees = dashboard.shown.frame.trees
+    row = nearest_tree(trees, (x, y), confirmed=True)
+    return None if row is None else int(trees.number[row])
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
     """Return an annotation, see `_rows`, as a GeoJSON feature (dict): a point at x, y with the `id` of the
-    annotation and the properties `class`, `dbh_cm`, `who` and `edited` (time as text)."""
-    properties = {"class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"], "edited": _when(row)}
+    annotation and the properties `class`, `dbh_cm`, `who`, `edited` (time as text) and `tree`."""
+    properties = {
+        "class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"], "edited": _when(row),
+        "tree": row["tree"],
+    }  # fmt: skip
     geometry = {"type": "Point", "coordinates": [row["x"], row["y"]]}
     return {"type": "Feature", "id": row["id"], "geometry": geometry, "properties": properties}
 
@@ -185,7 +203,8 @@ def _feature(row: dict[str, Any]) -> dict[str, Any]:
 def _row(row: dict[str, Any]) -> list[str]:
     """Return an annotation, see `_rows`, as the cells of `_Columns`; the DBH is "" if it is unknown."""
     dbh = "" if row["dbh_cm"] is None else f"{row['dbh_cm']:.2f}"
-    return [f"{row['x']:.4f}", f"{row['y']:.4f}", dbh, row["kind"], row["who"], _when(row)]
+    tree = "" if row["tree"] is None else str(row["tree"])
+    return [f"{row['x']:.4f}", f"{row['y']:.4f}", dbh, row["kind"], row["who"], _when(row), tree]
 
 
 def _when(row: dict[str, Any]) -> str:

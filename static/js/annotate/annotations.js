@@ -6,7 +6,7 @@ import { count, share } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { attempted, showNews } from "../core/problem.js";
-import { changed, on, selectedTree, state, trees } from "../core/store.js";
+import { changed, on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 
@@ -17,6 +17,7 @@ export const KINDS = ["tree", "pole", "person", "bush", "other"];
 const SKIPPED = "skipped"; // class of an annotation that states nothing
 export const STATES = ["open", "confirmed", "rejected", "skipped"]; // of a found tree in the review
 const LARGEST_DBH = 1000; // [cm]
+const MOST_ANSWERED = 20; // answers to which the review returns
 export const NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .@-]{0,39}$/u;
 
 export const draft = {
@@ -27,6 +28,7 @@ export const draft = {
   kind: "other", // class of a rejected tree
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
   answer: null, // {number, kind} of the last answer of the review
+  answered: [], // numbers of the trees that were answered, the newest last
   error: "",
   undo: 0,
   redo: 0,
@@ -70,11 +72,13 @@ export const send = (method, path, fields = {}) => request(path, { method, heade
 const call = (method, where, fields) => send(method, `/api/annotations${where}`, fields);
 
 // Edits are sent one at a time; each has come back before the next one is sent. An error stays until the person makes another
-// edit, and not only until the next one in the queue is stored.
+// edit, and not only until the next one in the queue is stored. An edit belongs to the run that was open when it was made.
 export function edit(work) {
+  const run = state.annotations?.run;
   draft.error = "";
   last = last.then(async () => {
     try {
+      if (run !== state.annotations?.run) throw new Error("Another run was opened meanwhile: this edit belongs to the one before and was not made.");
       const done = await work();
       Object.assign(draft, { undo: done.undo, redo: done.redo });
       await arrived(done.serial);
@@ -143,11 +147,12 @@ const edited = () => ({
 
 // All classes of annotations have one history: tells what the step changed, and selects the tree of a single annotation.
 async function turn(where, word) {
-  await settle();
+  const run = state.annotations?.run;
+  settle(); // queued before
   draft.answer = null;
-  let before = null, run = null;
+  let before = null;
   const done = await edit(() => {
-    [before, run] = [edited(), state.annotations?.run];
+    before = edited();
     return call("POST", where);
   });
   if (!done || run !== state.annotations?.run) return;
@@ -253,6 +258,7 @@ async function answer(tree, kind) {
   const { number } = tree, seen = annotationOf(tree);
   answering.add(number);
   draft.answer = { number, kind };
+  draft.answered = [...draft.answered.filter((each) => each !== number), number].slice(-MOST_ANSWERED);
   const stored = edit(async () => {
     const row = annotationOf(tree); // after the edits before this one
     const isSeen = row && row.id === seen?.id && row.version === seen.version;
@@ -313,6 +319,16 @@ export function following() {
   const open = left.find((each) => each.number !== state.selected && reviewOf(each) === "open");
   return open ?? left[(left.findIndex(({ number }) => number === state.selected) + 1) % left.length];
 }
+
+// Selects the tree that was answered before the selected one; the newest answer if the selected tree has none.
+export function previous() {
+  const numbers = answeredTrees().map(({ number }) => number), at = numbers.indexOf(state.selected);
+  const number = numbers.at(at < 0 ? -1 : Math.max(0, at - 1));
+  if (number !== undefined) select(number);
+}
+
+// The answered trees of the map, the newest last.
+export const answeredTrees = () => draft.answered.map(treeOf).filter(Boolean);
 
 // What the last answer of the review said ("Tree 40: pole"); "" before the first one.
 export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${draft.answer.kind}` : "");
@@ -380,7 +396,7 @@ export function startAnnotating() {
     if (rowOf(draft.chosen) === null) draft.chosen = null;
     if (state.annotations.run !== run) {
       run = state.annotations.run;
-      Object.assign(draft, { moved: null, error: "" });
+      Object.assign(draft, { moved: null, error: "", answer: null, answered: [] });
       versions.clear();
       votes = NO_VOTES;
       updateUndo();

@@ -1,13 +1,14 @@
 // The review card of the tab Annotate: what is known of the selected tree. The figures are those of its story.
 
 import { get } from "../core/api.js";
-import { byId, el, setText } from "../core/dom.js";
+import { button, byId, el, setText } from "../core/dom.js";
 import { capital, figure } from "../core/format.js";
 import { on, selectedTree, state, treeOf } from "../core/store.js";
 import { keepFresh, throttled } from "../core/timing.js";
 import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
 import { ofExtensions } from "../shell/extensions.js";
+import { openTab } from "../shell/tabs.js";
 import { annotating, annotationOf, draft, following, measureDbh, reviewOf, typedDbh } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
@@ -20,7 +21,8 @@ const evidence = () => byId("review-evidence");
 
 // The card around `hint`, which is visible without a selected tree, too.
 export const card = (hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
-  el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" })),
+  el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" }),
+    button("review-story", "Story", "Why the mapping decided so, with the figures behind it", () => openTab("story"), "quiet small")),
   el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
   el("div", { id: "review-evidence" }), hint,
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),

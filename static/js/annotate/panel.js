@@ -2,17 +2,19 @@
 
 import { button, byId, el, setText } from "../core/dom.js";
 import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
+import { select } from "../core/live_feed.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, previous, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, startCard } from "./card.js";
 import { startSection } from "./section.js";
 
 const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
 const EVERY = 300; // [ms] between two updates while a run plays
+const SHOWN_ANSWERS = 5;
 const LARGEST_TABLE = 900_000; // [bytes]
 const lines = new Map(); // rows of the table by the id of the annotation
 let imported = ""; // result of the last import
@@ -20,12 +22,7 @@ let imported = ""; // result of the last import
 function build() {
   const kind = el("select", { id: "annotate-kind", "aria-label": "Class of a rejected tree", onchange: () => { draft.kind = kind.value; } },
     ...KINDS.slice(1).map((each) => el("option", { value: each, text: each, selected: each === draft.kind })));
-  const name = el("input", { id: "annotate-name", type: "text", value: givenName(), placeholder: "your name", title: "Your edits are listed under this name, else under that of this browser", maxlength: "40", autocomplete: "off", onchange: () => {
-    const fits = !name.value.trim() || NAME.test(name.value.trim());
-    name.setCustomValidity(fits ? "" : "Begin with a letter or digit, then letters, digits, spaces and . @ - _");
-    name.reportValidity();
-    if (fits) callMe(name.value.trim());
-  } });
+  kind.title = "Its letter answers at once: P pole, H person, B bush, O other";
   const unit = el("select", { id: "annotate-unit", "aria-label": "Unit of a DBH column whose header names none" },
     ...[["", "unit of DBH in the file"], ["cm", "cm"], ["m", "m"], ["mm", "mm"]].map(([value, text]) => el("option", { value, text })));
   const file = el("input", { id: "annotate-file", type: "file", accept: ".csv,.txt,text/csv", hidden: true, "aria-label": "Table of trees", onchange: async () => {
@@ -33,7 +30,10 @@ function build() {
     file.value = "";
     if (chosen) await take(chosen, unit.value);
   } });
+  const asked = el("div", { id: "annotate-ask", class: "annotate-ask", hidden: Boolean(givenName()) }, el("label", {}, "Your name, stored with each answer ", nameField("annotate-asked")),
+    button("annotate-nameless", "Not now", "Answers are stored under the name of this browser", () => { asked.hidden = true; }, "quiet small"));
   byId("panel-annotate").replaceChildren(
+    asked,
     el("div", { class: "annotate-head" },
       el("p", { id: "annotate-count", class: "annotate-count" }),
       button("annotate-add", "Add (A)", "Add trees by clicks on the map (A)", () => toggleAdding()),
@@ -44,7 +44,9 @@ function build() {
       button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree"), ""),
       button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class on the right (N)", () => review(draft.kind), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
       button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, "")),
-    el("p", { id: "review-last", class: "review-last", hidden: true, role: "status" }, el("span"), " ", button("review-back", "Undo", "Undo this answer (Ctrl+Z)", undo, "quiet small")),
+    el("div", { class: "review-said" },
+      el("p", { id: "review-last", class: "review-last", hidden: true, role: "status" }, el("span"), " ", button("review-back", "Undo", "Undo this answer (Ctrl+Z)", undo, "quiet small")),
+      el("div", { id: "review-history", class: "review-history", role: "group", "aria-label": "Last answers", hidden: true })),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     card(el("p", { id: "annotate-hint", class: "note dim", role: "status" })),
     el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
@@ -55,11 +57,25 @@ function build() {
       el("table", { id: "annotations", class: "plain" }, el("thead", {}, el("tr", {},
         ...["tree", "class", "DBH cm", "x m", "y m", "by"].map((text) => el("th", { scope: "col", text })), el("td"))), el("tbody"))),
     el("div", { class: "annotate-files" },
-      el("label", {}, "Name ", name),
+      el("label", {}, "Name ", nameField("annotate-name")),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,
       el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "Save CSV", title: "Download the annotations as CSV" }),
       el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "Save GeoJSON", title: "Download the annotations as GeoJSON" })),
     ...ofExtensions("annotateSections"));
+}
+
+// Both fields show the name; the one at the top asks for it until it is given.
+function nameField(id) {
+  const field = el("input", { id, type: "text", value: givenName(), placeholder: "your name", title: "Your edits are listed under this name, else under that of this browser", maxlength: "40", autocomplete: "name", onchange: () => {
+    const name = field.value.trim(), fits = !name || NAME.test(name);
+    field.setCustomValidity(fits ? "" : "Begin with a letter or digit, then letters, digits, spaces and . @ - _");
+    field.reportValidity();
+    if (!fits) return;
+    callMe(name);
+    for (const each of ["annotate-asked", "annotate-name"]) byId(each).value = name;
+    byId("annotate-ask").hidden = Boolean(name);
+  } });
+  return field;
 }
 
 async function take(file, unit) {
@@ -127,11 +143,25 @@ function fill() {
   fillCard();
   byId("review-last").hidden = !answerText();
   setText(byId("review-last").firstChild, answerText());
+  fillHistory();
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), contradictionText());
   fillTable();
 }
+
+// The last answers, the newest first, in the words of what is stored now; a click shows the tree again.
+function fillHistory() {
+  const box = byId("review-history"), shown = answeredTrees().slice(-SHOWN_ANSWERS).reverse();
+  const now = JSON.stringify([shown.map((tree) => [tree.number, classOf(tree)]), state.selected]);
+  box.hidden = !shown.length;
+  if (box.dataset.now === now) return; // the focus stays on a button
+  box.dataset.now = now;
+  box.replaceChildren(button("review-previous", "Previous (R)", "Show the tree of the answer before, to change it (R)", previous, "quiet small"),
+    ...shown.map((tree) => el("button", { class: "quiet small", type: "button", "aria-pressed": String(tree.number === state.selected), text: `${tree.number} ${classOf(tree)}`, title: `Show tree ${tree.number} again`, onclick: () => select(tree.number) })));
+}
+
+const classOf = (tree) => annotationOf(tree)?.kind ?? "open";
 
 function hint(tree) {
   if (draft.adding) return "Click on the map where a tree is missing; the ring shows where it will be added. Scores count trees near the path only (Tune, Evaluation, Reach). Esc ends.";
@@ -169,10 +199,11 @@ export function startAnnotatePanel() {
 // --- keys of the tab; they act while it is open, unless a person types -----------------------------------
 
 const STEP = 0.01; // [m]
+const CLASS_KEYS = { p: "pole", h: "person", b: "bush", o: "other" }; // the letters of the verdicts
 const ARROWS = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP] };
 
 export const ANNOTATE_KEYS = [
-  ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["s", "in the tab Annotate: skip to the next tree to review"],
+  ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["p h b o", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
   ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "undo and redo an edit"], ["shift+click", "in the 3D scene: add a tree there"],
 ];
 
@@ -202,7 +233,9 @@ function keyOfTab({ key }) {
   if (key === "a") toggleAdding();
   else if (key === "y") review("tree");
   else if (key === "n") review(draft.kind);
+  else if (key in CLASS_KEYS) review(CLASS_KEYS[key]);
   else if (key === "s") skip();
+  else if (key === "r") previous();
   else if (key === "Escape" && draft.adding) toggleAdding(false);
   else return false;
   return true;

@@ -15,8 +15,11 @@ const LOOPS = [
   ["tie", "Same place", "The robot was at one place twice and the map does not know it: click a stem, and the same stem seen again. Path and map follow"],
   ["forbid", "Forbid loop", "A loop of the map is wrong: click its dashed line. Path and map follow"],
 ];
-const WORDS = {
-  merge: "two trees merged", split: "tree split", move: "tree moved", class: "class", delete: "tree deleted", tie: "same place", forbid: "loop forbidden",
+const WORDS = { merge: "two trees merged", split: "tree split", move: "tree moved", class: "class", delete: "tree deleted", tie: "same place", forbid: "loop forbidden" };
+// What a repair did to the trees with the numbers a and b.
+const DONE = {
+  merge: (a, b) => b && `tree ${b} merged into tree ${a}`, split: (a) => `tree ${a} split`, move: (a) => `tree ${a} moved`, class: (a, b, value) => `tree ${a} is a ${value}`,
+  delete: (a) => `tree ${a} deleted`, tie: (a, b) => b && (a === b ? `tree ${a} at the same place` : `same place: trees ${a} and ${b}`), forbid: () => "",
 };
 const LARGEST_FILE = 900_000; // [bytes]
 
@@ -49,12 +52,21 @@ function build() {
       el("a", { id: "repair-save", class: "small", href: "/api/repairs.json", download: "repairs.json", text: "Save repairs", title: "A file for Import and for `stemmap map --repairs`" })));
 }
 
-function lineOf(row, problem) {
+// In the words of the trees where they are known, else of the place.
+function wordsOf(row, [a, b] = []) {
+  const done = a && DONE[row.kind](a, b, row.value);
+  if (done) return done;
+  const place = isOfLoop(row) ? "" : ` at ${placeText(row)}`;
+  return `${WORDS[row.kind]}${row.value ? ` ${row.value}` : ""}${place}`;
+}
+
+const isOfLoop = ({ kind }) => ["tie", "forbid"].includes(kind); // its positions are in the frame of the robot
+const placeText = (row) => row.places[0].map((v) => v.toFixed(1)).join(", ");
+
+function lineOf(row, problem, numbers) {
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete this repair", "aria-label": `Delete repair ${row.id}`, "data-edit": true, onclick: () => removeRepair(row) });
-  const place = ["tie", "forbid"].includes(row.kind) ? "" : ` at ${row.places[0].map((v) => v.toFixed(1)).join(", ")}`;
-  const text = `${WORDS[row.kind]}${row.value ? ` ${row.value}` : ""}${place}`;
-  return el("li", { "data-repair": row.id, class: problem ? "problem" : "" },
-    el("span", { class: "grow" }, text, ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
+  return el("li", { "data-repair": row.id, class: problem ? "problem" : "", title: isOfLoop(row) ? "" : `at ${placeText(row)} m` },
+    el("span", { class: "grow" }, wordsOf(row, numbers), ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
     el("span", { class: "dim", text: row.who }), gone);
 }
 
@@ -76,10 +88,11 @@ function fill() {
   setText(byId("repair-hint"), hint() || (tree ? `Tree ${tree.number} is selected.` : "Select a tree on the map, or press a tool. The recording is unchanged; each repair can be undone."));
   setText(byId("repair-error"), state.annotations?.problem || draft.error);
   byId("repair-error").hidden = !byId("repair-error").textContent;
-  const list = byId("repairs"), now = JSON.stringify([rows.map(({ id, version }) => [id, version]), known && problems]);
+  const list = byId("repairs"), numbers = known ? state.map.repaired_numbers : [];
+  const now = JSON.stringify([rows.map(({ id, version }) => [id, version]), known && problems, numbers]);
   if (list.dataset.now === now) return; // the focus stays in the list
   list.dataset.now = now;
-  list.replaceChildren(...rows.map((row, k) => lineOf(row, known ? problems[k] : "")).reverse());
+  list.replaceChildren(...rows.map((row, k) => lineOf(row, known ? problems[k] : "", numbers[k])).reverse());
 }
 
 export const REPAIR_KEYS = [["del", "in the tab Repair: delete the selected tree from the map"]];

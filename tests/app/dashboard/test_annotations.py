@@ -211,13 +211,28 @@ async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
     assert 'filename="truth.csv"' in out.headers["content-disposition"]
     read = contents_of(parse_truth_trees(out.text, where="here"))
     assert read == [Content(1.5, 2.5, "tree", 0.31), Content(3.0, 4.0, "pole", None)]
-    assert out.text.splitlines()[0] == "x_m,y_m,dbh_cm,class,who,edited"
+    assert out.text.splitlines()[0] == "x_m,y_m,dbh_cm,class,who,edited,tree"
     told = json.loads((await client.get("/api/annotations.geojson")).text)
     assert told["coordinateFrame"]["type"] == "local"
     assert [f["geometry"]["coordinates"] for f in told["features"]] == [[1.5, 2.5], [3.0, 4.0]]
     assert told["features"][0]["properties"]["dbh_cm"] == 31.0
     await edit(client, "POST", "/undo")
     assert await rows(client) == []
+
+
+async def test_a_saved_table_names_the_trees_of_the_map() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        trees = dashboard.shown.frame.trees  # type: ignore[union-attr]
+        row = int(np.flatnonzero(trees.confirmed)[0])
+        x, y = trees.position[row].tolist()
+        for place in ((x + 0.3, y), (x + 500.0, y)):
+            await edit(client, "POST", x=place[0], y=place[1])
+        table = (await client.get("/api/annotations.csv")).text.splitlines()
+        assert [line.split(",")[-1] for line in table] == ["tree", str(trees.number[row]), ""]
+        features = json.loads((await client.get("/api/annotations.geojson")).text)["features"]
+        assert [each["properties"]["tree"] for each in features] == [trees.number[row], None]
 
 
 @pytest.mark.parametrize("metres", [1.0, 0.3048])

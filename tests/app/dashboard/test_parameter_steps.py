@@ -102,6 +102,24 @@ def test_what_was_undone_is_gone_after_another_change():
     assert (state.as_plain()["undo"], state.as_plain()["redo"]) == (1, 0)
 
 
+def test_steps_of_another_run_are_not_done_again_in_this_one():
+    state = ParameterState()
+    assert state.suit("forest", "a")
+    state.change({"clustering.eps": 0.2})
+    state.undo()
+    assert not state.suit("forest", "a")  # the same run again
+    assert state.as_plain()["redo"] == 1
+    assert state.suit("forest", "b")
+    assert (state.as_plain()["undo"], state.as_plain()["redo"]) == (0, 0)
+    state.change({"clustering.eps": 0.2})
+    state.change({"slam.particles": 50})
+    state.undo()
+    state.suit("forest", "c")  # the radius is still in force, and can be taken back
+    assert (state.as_plain()["undo"], state.as_plain()["redo"]) == (1, 0)
+    state.undo()
+    assert state.parameters == preset("forest")
+
+
 def test_a_refused_change_is_no_step():
     state = ParameterState()
     with pytest.raises(ParameterError):
