@@ -146,10 +146,10 @@ class WorkerLoop:
             self._replay.mapped(frame.stamp_ns, now)
         if hurried and session.pace != "hurry":  # arrived: time counts from here
             self._replay.release()
-        elif hurried and (now < self._glimpse_at or session.is_shown):
+        elif hurried and (now < self._glimpse_at or session.shown.is_stored):
             return
         self._glimpse_at = now + _GLIMPSE_S
-        self._show(session.frame)
+        self._show(session.shown.frame)
         if session.pace == "idle":
             self._report()
         else:
@@ -157,7 +157,7 @@ class WorkerLoop:
 
     def _answer(self, question: protocol.Question) -> None:
         """Answer a question; a comparison waits until the mapper has reached the shown scan."""
-        while isinstance(question, protocol.AskCompare) and self._session.is_shown:
+        while isinstance(question, protocol.AskCompare) and self._session.shown.is_stored:
             self._guarded(self._work)
         self._put(answer(self._session, self._recent, question, self._run))
         if self._is_compiling_reported:  # an answer may compile other kernels than the run
@@ -221,7 +221,7 @@ class WorkerLoop:
         An error of the source sets the state to "failed" and is reported.
         """
         pace = self._session.pace
-        if self._session.is_shown:
+        if self._session.shown.is_stored:
             return self._quiet_s()
         if pace == "idle":
             return None
@@ -300,7 +300,7 @@ class WorkerLoop:
                 self._begin(command)
             case protocol.SetRepairs(run=run, repairs=repairs):
                 if run == self._run:
-                    self._show(session.set_repairs(repairs))
+                    self._show(session.shown.set_repairs(repairs))
 
     def _open(self, command: protocol.Open) -> None:
         """Open a source as the next run: send the status "starting" before, and `Opened` once it is open. A
@@ -408,15 +408,15 @@ class WorkerLoop:
     def _show(self, frame: Frame | None) -> None:
         """Queue the frame of the session with its repairs, the path and the confirmation times; nothing for
         None."""
-        session, path, repaired = self._session, self._session.path, self._session.repaired
-        frame = None if frame is None else session.frame
+        session, path, repaired = self._session, self._session.shown.path, self._session.shown.repaired
+        frame = None if frame is None else session.shown.frame
         if frame is not None and path is not None:
-            of_trees, counts = session.confirmed_s, session.counts
-            odometry_xy = session.odometry_xy[: len(path.x)]
+            of_trees, counts = session.shown.confirmed_s, session.shown.counts
+            odometry_xy = session.shown.odometry_xy[: len(path.x)]
             self._put(
                 protocol.Shown(
                     self._run,
-                    session.time_s,
+                    session.shown.time_s,
                     frame,
                     0,
                     path,
@@ -424,8 +424,8 @@ class WorkerLoop:
                     counts,
                     odometry_xy,
                     () if repaired is None else repaired.problems,
-                    session.loops,
-                    () if repaired is None else session.repairs,
+                    session.shown.loops,
+                    () if repaired is None else session.shown.repairs,
                     () if repaired is None else repaired.numbers,
                 )
             )
@@ -528,7 +528,7 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
         case protocol.AskSection():
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
-            return protocol.Answer(ticket, section=section(session.accumulated))
+            return protocol.Answer(ticket, section=section(session.shown.accumulated))
         case protocol.AskCourse(names=names, most=most, stages=stages):
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
@@ -537,7 +537,7 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
             if isinstance(run, OneStepRun):
                 return protocol.Answer(ticket, tree=run.tree_story(tree))
             return protocol.Answer(
-                ticket, tree=tree_story(run, session.frame, tree, session.mapped_place(tree))
+                ticket, tree=tree_story(run, session.shown.frame, tree, session.shown.mapped_place(tree))
             )
         case protocol.AskCluster(scan=scan, cluster=cluster):
             frame = recent.find(question.run, scan)

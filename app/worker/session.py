@@ -6,8 +6,6 @@ It has no thread, socket or clock; the loop of the worker reads `pace` and calls
 from __future__ import annotations
 
 import math
-import sys
-import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -28,29 +26,23 @@ from app.worker.protocol import (
     MapChanges,
     Open,
     Opened,
-    RunCounts,
-    Shown,
     State,
     Status,
 )
 from app.worker.remap import MapComparison
 from app.worker.run import MakeMapper, Run
+from app.worker.shown_map import AnyRun, ShownMap
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SHOWN_NS, PictureSource
 from pipeline.io.readers.topics import COMPRESSED_IMAGE, IMAGE
 from pipeline.odometry.odometry_override import OdometryOverride
-from pipeline.repairs.record import Repair
-from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer, loops_of
-from pipeline.slam.keyframe_graph import KeyframeGraph
-from pipeline.types.records import Float, Float32, Frame, Int, Path, Trees
+from pipeline.types.records import Frame, Path, Trees
 from pipeline.types.units import SECOND_NS
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
 Pace = Literal["idle", "replay", "hurry", "live"]
-AnyRun = Run | OneStepRun
-
 _MOST_WARNINGS = 20
 
 
@@ -72,6 +64,7 @@ class Session:
         on_preview: Called by `remap` with the revision of the parameters and the preview trees of a rerun,
             before any scan is mapped again.
         unmapped: Number of scans of the run that `show_unmapped` returned.
+        shown: The map that is shown.
     """
 
     def __init__(
@@ -90,18 +83,12 @@ class Session:
         self._parameters = parameters
         self._revision = 0
         self._request: Open | None = None
-        self._run: AnyRun | None = None
         self._robot: LiveSource | None = None
         self._state: State = "starting"
         self._detail = ""
         self._target = SeekTarget()
-        self._kept: Shown | None = None  # the sought scan, as long as the mapper is on its way to it
         self._comparison = MapComparison()
-        self._repairs: tuple[Repair, ...] = ()
-        self._repairer = Repairer()
-        #: Frame before the repairs, whether its loops were repaired by an earlier solution, and the map.
-        self._repaired: tuple[Frame, bool, RepairedMap] | None = None
-        self._faults: dict[str, None] = {}  # of the repairs, that were printed
+        self.shown = ShownMap(lambda: self._state == "playing" or self._target.sought)
         self._remaps_on_arrival = False
         self._warnings: dict[str, None] = {}
         self.on_preview: Callable[[int, Trees], None] = lambda _revision, _trees: None
@@ -111,159 +98,23 @@ class Session:
         """When the next scan is mapped: "hurry" immediately, while seeking; "replay" at its time; "live" on
         arrival, also before the run of a robot is opened; "idle" not at all: paused, finished, failed, or
         without a run."""
-        if self._state == "failed" or (self._run is None and self._robot is None):
+        if self._state == "failed" or (self.run is None and self._robot is None):
             return "idle"
         if self._robot is not None:
-            return "live" if self._run is None or self._state == "playing" else "idle"
+            return "live" if self.run is None or self._state == "playing" else "idle"
         if self._target.sought:
             return "hurry"
         return "replay" if self._state == "playing" else "idle"
 
     @property
-    def frame(self) -> Frame | None:
-        """Frame of the current scan, or of the sought scan if it was mapped, with the repairs; None if there
-        is no run, or before its first scan."""
-        repaired = self.repaired
-        if repaired is not None:
-            return repaired.frame
-        shown = self._kept or self._run
-        return shown.frame if shown else None
-
-    @property
-    def repaired(self) -> RepairedMap | None:
-        """The map with the repairs; None without repairs, and without a map. While the run plays or a scan is
-        sought, loops are repaired by an earlier solution. If the repairs fail, the map is without them, and
-        the error is the problem of each."""
-        shown, run = self._kept or self._run, self._run
-        if not self._repairs or shown is None or shown.frame is None or run is None:
-            return None
-        hurried = self._is_hurried
-        if self._repaired is not None and self._repaired[0] is shown.frame and self._repaired[1] <= hurried:
-            return self._repaired[2]
-        of_drive = isinstance(run, Run) and self._kept is None
-        graph, landmarks = KeyframeGraph(), np.full(len(shown.frame.trees.number), -1)
-        if isinstance(run, Run) and of_drive:
-            graph, landmarks = run.graph, run.tree_landmarks
-        of_run = MapOfRun(shown.frame, shown.path, graph, landmarks)
-        try:
-            found = self._repairer.repaired(of_run, self._repairs, hurried=hurried)
-        except (ValueError, ArithmeticError, IndexError) as error:  # LinAlgError is a ValueError
-            fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
-            if fault not in self._faults:
-                self._faults[fault] = None
-                traceback.print_exc(file=sys.stderr)
-            problems = (fault,) * len(self._repairs)
-            numbers = ((),) * len(problems)
-            found = RepairedMap(shown.frame, shown.path, problems, numbers, loops_of(graph), None)
-        self._repaired = (shown.frame, hurried, found)
-        return found
-
-    @property
-    def repairs(self) -> tuple[Repair, ...]:
-        """The repairs of the map."""
-        return self._repairs
-
-    @property
-    def _is_hurried(self) -> bool:
-        """Whether loops are repaired by an earlier solution."""
-        is_on_way = self._state == "playing" or self._target.sought
-        return is_on_way and any(repair.is_of_loop for repair in self._repairs)
-
-    def _forget_repaired(self) -> None:
-        """Repair the map anew, because the run has another one."""
-        self._repairer, self._repaired = Repairer(), None
-
-    @property
-    def loops(self) -> Int:
-        """Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2)."""
-        repaired = self.repaired
-        if repaired is not None:
-            return repaired.loops
-        return loops_of(self._run.graph if isinstance(self._run, Run) else KeyframeGraph())
-
-    @property
-    def accumulated(self) -> Float32:
-        """Points of all scans up to the current one, see `Run.accumulated`, after the repairs of loops; none
-        without a run."""
-        run, repaired = self._run, self.repaired
-        points = np.zeros((0, 3), np.float32) if run is None else run.accumulated
-        if not isinstance(run, Run) or repaired is None or repaired.correction is None:
-            return points
-        scans = run.voxels.latest[: len(points)].astype(np.int64)
-        place, _ = repaired.correction.moved(points[:, :2].astype(np.float64), scans)
-        return np.column_stack([place, points[:, 2]]).astype(np.float32)
-
-    def mapped_place(self, number: int) -> Float | None:
-        """Return the position of a tree in the map before the repairs, shape (2,) [m]; None if that map has
-        no tree of this number."""
-        shown = self._kept or self._run
-        if shown is None or shown.frame is None:
-            return None
-        rows = np.flatnonzero(shown.frame.trees.number == number)
-        return shown.frame.trees.position[rows[0]] if len(rows) else None
-
-    def set_repairs(self, repairs: tuple[Repair, ...]) -> Frame | None:
-        """Set the repairs of the map and return the frame of the current scan with them; None before the
-        first scan."""
-        self._repairs, self._repaired, self._faults = repairs, None, {}
-        if any(repair.is_of_loop for repair in repairs):
-            self._kept = None  # its graph is not stored, see `_show_kept`
-        return self.frame
-
-    @property
-    def path(self) -> Path | None:
-        """Path up to the scan of `frame`, without rows before its first scan; None if there is no run."""
-        repaired = self.repaired
-        if repaired is not None:
-            return repaired.path
-        shown = self._kept or self._run
-        return shown.path if shown else None
-
-    @property
-    def odometry_xy(self) -> Float:
-        """Positions x, y of the robot by odometry alone, of all mapped scans, shape (N, 2) [m]; no rows if
-        they are unknown."""
-        return np.zeros((0, 2)) if self._run is None else self._run.odometry_xy
-
-    @property
-    def confirmed_s(self) -> Float | None:
-        """Confirmation time of each tree of `frame`, shape (T,) [s since the first scan], NaN for trees that
-        never were confirmed; None if there is no frame."""
-        shown, frame = self._kept or self._run, self.frame
-        known = shown.confirmed_s if shown else None
-        if shown is None or known is None or shown.frame is None or frame is None or frame is shown.frame:
-            return known
-        of = dict(zip(shown.frame.trees.number.tolist(), known.tolist(), strict=True))
-        return np.array([of.get(number, np.nan) for number in frame.trees.number.tolist()], np.float64)
-
-    @property
-    def counts(self) -> RunCounts | None:
-        """Counts of the run up to the scan of `frame`; None if there is no frame."""
-        frame = self.frame
-        return None if self._run is None or frame is None else self._run.counts(frame.index)
-
-    @property
-    def is_shown(self) -> bool:
-        """Whether a sought scan is shown from its stored results, while the mapper is on its way to it."""
-        return self._kept is not None
-
-    @property
-    def time_s(self) -> float:
-        """Time of the scan of `frame` since the first scan of the run [s]; 0 before the first scan."""
-        frame = self.frame
-        return (
-            0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / SECOND_NS
-        )
-
-    @property
     def run(self) -> AnyRun | None:
         """The open run, or None."""
-        return self._run
+        return self.shown.run
 
     def next_ns(self) -> int | None:
         """Return the time of the next scan [ns]; None if there is no run, at the end of the run, or before a
         live scan arrived. Raises SourceError if nothing more can be read."""
-        return self._run.peek_ns() if self._run else None
+        return self.run.peek_ns() if self.run else None
 
     def open(self, request: Open) -> Opened | None:
         """Close the present run and open another source, paused before its first scan; preset and parameters
@@ -306,12 +157,12 @@ class Session:
         """
         if self._robot is None or self._request is None:
             return None
-        is_heard = self._run is None and self._robot.listen()
+        is_heard = self.run is None and self._robot.listen()
         notices = self._robot.notices()
         self._warn(notices)
         opened = self._begin(self._robot, self._request) if is_heard else None
-        if isinstance(self._run, Run):
-            self._run.warnings += notices
+        if isinstance(self.run, Run):
+            self.run.warnings += notices
         return opened
 
     def _begin(self, source: Source | LiveSource, request: Open) -> Opened:
@@ -330,7 +181,7 @@ class Session:
         except BaseException:
             source.close()
             raise
-        self._run, self._state, self._detail = run, "paused", ""
+        self.shown.run, self._state, self._detail = run, "paused", ""
         self.unmapped = 0
         if isinstance(run, Run):
             self._is_segmenting = next(self._compiling, False)
@@ -346,30 +197,30 @@ class Session:
             SourceError: There is no scan, or it cannot be read.
             StemmapError: The scan cannot be mapped, or a process that compiles cannot be started.
         """
-        if isinstance(self._run, Run):
+        if isinstance(self.run, Run):
             has_front_end = next(self._compiling, None)
             if has_front_end is not None:
                 self._is_segmenting = has_front_end
                 return False
             self._compiling = self._compile()  # for the next run, whose kernels may be others
-            self._run.prepare()
-            stories.warm_up(self._run.source.description.sensor)
+            self.run.prepare()
+            stories.warm_up(self.run.source.description.sensor)
         return True
 
     def show_unmapped(self) -> Frame | None:
         """Return the next scan of a run that waits for its kernels, see `Run.next_unmapped`, and count it in
         `unmapped`; None without one. Errors as there."""
-        if not isinstance(self._run, Run):
+        if not isinstance(self.run, Run):
             return None
-        frame = self._run.next_unmapped(segmented=self._is_segmenting)
+        frame = self.run.next_unmapped(segmented=self._is_segmenting)
         self.unmapped += frame is not None
         return frame
 
     def disturb(self) -> None:
         """Discard the time measurement of the scan that is mapped now, since the mapping waits for something
         else. Nothing without a run."""
-        if self._run is not None:
-            self._run.stopwatch.disturb()
+        if self.run is not None:
+            self.run.stopwatch.disturb()
 
     def work(self) -> Frame | None:
         """Map at most one scan and return its frame. In a seek, each call maps one scan on the way, whose
@@ -383,7 +234,7 @@ class Session:
         Raises:
             StemmapError: Nothing more can be read, or the scan cannot be mapped.
         """
-        run = self._run
+        run = self.run
         if run is None or self.pace == "idle":
             return None
         self._target.set_out(run)
@@ -414,13 +265,13 @@ class Session:
             StemmapError: As in `open`.
         """
         opened = None
-        if self._run is None and self._robot is not None and self._state != "failed":
+        if self.run is None and self._robot is not None and self._state != "failed":
             return None  # it plays when scans arrive
-        if self._run is None or self._state == "failed":
+        if self.run is None or self._state == "failed":
             opened = None if self._request is None else self.open(self._request)
         elif self._state == "finished":
             self._target.to_scan(0)
-        if self._run is not None:
+        if self.run is not None:
             self._state, self._detail = "playing", ""
         return opened
 
@@ -431,10 +282,10 @@ class Session:
             The current scan if its loops were repaired by an earlier solution and are now by their own; else
             None.
         """
-        was_hurried = self._is_hurried
+        was_hurried = self.shown.is_hurried
         if self._state == "playing":
             self._state = "paused"
-        return self.frame if was_hurried and not self._is_hurried else None
+        return self.shown.frame if was_hurried and not self.shown.is_hurried else None
 
     def advance(self, scans: int) -> Frame | None:
         """Pause and seek a number of scans forward, or back if it is negative, from the sought scan if its
@@ -442,14 +293,14 @@ class Session:
         message that it cannot seek; nothing happens without a run.
 
         Returns:
-            The sought scan if it was mapped, see `is_shown`; else None.
+            The sought scan if it was mapped, see `ShownMap.is_stored`; else None.
         """
-        if self._run is None or self._is_live():
+        if self.run is None or self._is_live():
             return None
-        here = self._run.current if self._target.index is None else self._target.index
+        here = self.run.current if self._target.index is None else self._target.index
         self._settle()
         self._target.to_scan(max(0, here + scans))
-        return self._show_kept(self._run)
+        return self.shown.show_stored(self._target.index, self._parameters)
 
     def seek(self, time_s: float) -> Frame | None:
         """Seek to the last scan not later than a time; a playing run then plays on, any other is paused.
@@ -457,26 +308,15 @@ class Session:
         it cannot seek.
 
         Returns:
-            The sought scan if it was mapped, see `is_shown`; else None.
+            The sought scan if it was mapped, see `ShownMap.is_stored`; else None.
         """
-        if self._run is None or not math.isfinite(time_s) or self._is_live():
+        if self.run is None or not math.isfinite(time_s) or self._is_live():
             return None
         if self._state != "playing":
             self._settle()
         seconds = min(max(time_s, 0.0), LONGEST_S)
-        self._target.to_time(self._run, self._run.start_ns + round(seconds * SECOND_NS))
-        return self._show_kept(self._run)
-
-    def _show_kept(self, run: AnyRun) -> Frame | None:
-        """Show the sought scan from its stored results, and return it. None if its index is not known yet, it
-        is the current scan, is not stored, or would be mapped with other parameters on arrival."""
-        index, self._kept = self._target.index, None
-        if index is None or (index == run.current and run.is_whole):
-            return None
-        loops = any(repair.is_of_loop for repair in self._repairs)  # the graph of that scan is not stored
-        if run.parameters_at(index) == self._parameters and not loops:
-            self._kept = run.kept(index)
-        return self.frame if self.is_shown else None
+        self._target.to_time(self.run, self.run.start_ns + round(seconds * SECOND_NS))
+        return self.shown.show_stored(self._target.index, self._parameters)
 
     def set_parameters(
         self, parameters: Parameters, revision: int, *, whole: bool = False, step: int | None = None
@@ -500,11 +340,11 @@ class Session:
         """
         self._parameters, self._revision = parameters, revision
         self._comparison.begin(step)
-        run = self._run
+        run = self.run
         if run is None:
             return None
         run.cancel_remapping()
-        self._forget_repaired()
+        self.shown.forget_repaired()
         if self._target.sought:  # see `_arrive`
             self._remaps_on_arrival = whole
             return None
@@ -520,7 +360,7 @@ class Session:
     @property
     def is_remapping(self) -> bool:
         """Whether a rerun is in progress and can continue now, that is, no scan is sought."""
-        return self._run is not None and self._run.remapped is not None and not self._target.sought
+        return self.run is not None and self.run.remapped is not None and not self._target.sought
 
     def remap(self) -> tuple[Frame, MapChanges] | None:
         """Take the next step of a rerun: of its preview, or a scan. If the scan cannot be read, the rerun
@@ -531,7 +371,7 @@ class Session:
             After the last scan, the frame of the current scan in the new map and the differences; before, and
             without a rerun, None.
         """
-        run, shown = self._run, self.frame
+        run, shown = self.run, self.shown.frame
         if run is None or shown is None:
             return None
         try:
@@ -542,9 +382,9 @@ class Session:
         if done is None:
             return None
         frame, confirmed_s = done
-        self._forget_repaired()
-        frame = self.frame or frame
-        changes = self._comparison.changes(shown, frame, self._revision, self.time_s, confirmed_s)
+        self.shown.forget_repaired()
+        frame = self.shown.frame or frame
+        changes = self._comparison.changes(shown, frame, self._revision, self.shown.time_s, confirmed_s)
         if self._robot is not None:
             self._robot.use_parameters(self._revision, 0, run.parameters_at(0))
         return frame, changes
@@ -555,50 +395,48 @@ class Session:
         Raises:
             StemmapError: There is no current scan, or a set cannot be used.
         """
-        if self._run is None or self._state == "failed":
+        if self.run is None or self._state == "failed":
             raise StemmapError("nothing is mapped", remedy="Press play, or open a run")
-        return self._run.map_with(sets)
+        return self.run.map_with(sets)
 
     def fail(self, detail: str) -> None:
         """Set the state "failed" with the reason `detail`; a seek and a rerun are cancelled. The run stays
         open until `play` or `open`."""
         self._state, self._detail = "failed", detail
         self._target.forget()
-        self._kept = None
-        if self._run is not None:
-            self._run.cancel_remapping()
+        self.shown.show_current()
+        if self.run is not None:
+            self.run.cancel_remapping()
 
     def status(self) -> Status:
         """Return the status of the run, also if none is open. The loop knows its speed, its scan rate and,
         unless it is live, its number of scans behind; here they have the defaults of `Status`."""
-        run, robot = self._run, self._robot
+        run, robot = self.run, self._robot
         status = Status(
             state=self._state,
             detail=self._detail,
             source=self._request.uri if self._request else "",
-            time_s=self.time_s,
+            time_s=self.shown.time_s,
             warnings=list(self._warnings),
             revision=self._revision,
-            going_to="" if self.is_shown else self._target.words(run),
-            going_to_s=None if self.is_shown else self._target.time_s(run),
+            going_to="" if self.shown.is_stored else self._target.words(run),
+            going_to_s=None if self.shown.is_stored else self._target.time_s(run),
             unmapped=self.unmapped,
         )
-        status = status if run is None else _with_run(status, run, self.frame, self.path)
+        status = status if run is None else _with_run(status, run, self.shown.frame, self.shown.path)
         return status if robot is None else with_robot(status, robot)
 
     def close(self) -> None:
         """Close the run or the robot, if one is open, and forget seek, warnings and comparison. State and
         parameters stay, and `play` can open the source again."""
-        owner = self._run or self._robot
+        owner = self.run or self._robot
         if owner is not None:
             owner.close()
-        self._run, self._robot, self._comparison = None, None, MapComparison()
+        self._robot, self._comparison = None, MapComparison()
         self._remaps_on_arrival = False
         self._warnings.clear()
         self._target.forget()
-        self._kept = None
-        self._repairs, self._faults = (), {}
-        self._forget_repaired()
+        self.shown.begin(None)
 
     def end_recording(self) -> bool:
         """Finish the recording of a live run, which waits up to 8 s for the disk, and return whether the run
@@ -624,7 +462,7 @@ class Session:
         scan onwards, and a rerun that was requested begins. Raises StemmapError if the scan cannot be mapped
         again."""
         self._target.forget()
-        self._kept = None
+        self.shown.show_current()
         changed = run.use(self._parameters, run.current)
         if self._remaps_on_arrival:
             self._remaps_on_arrival = False

@@ -46,14 +46,14 @@ def test_a_comparison_leaves_no_trace_in_the_run():
         stand_at(each, 12)
     sets = [preset("paper"), preset("forest"), Parameters().replace({"clustering.eps": 0.6})]
     compared = session.compare(sets)
-    assert_same(compared[1], other.frame)  # type: ignore[arg-type]
+    assert_same(compared[1], other.shown.frame)  # type: ignore[arg-type]
     assert len(compared[0].clusters.size) != len(compared[1].clusters.size)
     assert_same(session.compare(sets[1:])[0], compared[1])
     for with_it, without in zip(frames_of(session, 12), frames_of(other, 12), strict=True):
         assert_same(with_it, without)
-    assert session.path is not None
-    assert other.path is not None
-    np.testing.assert_array_equal(session.path.sigma_xy, other.path.sigma_xy)
+    assert session.shown.path is not None
+    assert other.shown.path is not None
+    np.testing.assert_array_equal(session.shown.path.sigma_xy, other.shown.path.sigma_xy)
     session.close()
     other.close()
 
@@ -66,7 +66,7 @@ def test_what_is_compared_is_not_measured_and_a_failure_leaves_the_run_whole():
     with pytest.raises(StemmapError, match="no scan is mapped yet"):
         session.compare([Parameters()])
     first = stand_at(session, 2)
-    run = session._run
+    run = session.run
     assert run is not None
     before = dict(run.stopwatch.stage_ms)
     session.compare([Parameters().replace({"clustering.eps": 0.3})])

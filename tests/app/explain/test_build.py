@@ -19,8 +19,8 @@ def drive(session: Session) -> Run:
 
 
 def frame_of(session: Session) -> Frame:
-    assert session.frame is not None
-    return session.frame
+    assert session.shown.frame is not None
+    return session.shown.frame
 
 
 def test_the_verdict_of_every_cluster_is_that_of_its_first_check_that_fails(session: Session):
@@ -75,7 +75,7 @@ def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Sessio
     rows = np.flatnonzero(trees.confirmed & (trees.observations >= 12) & near)
     assert len(rows) > 5
     for row in rows:
-        story = tree_story(drive(session), session.frame, int(trees.number[row]))
+        story = tree_story(drive(session), session.shown.frame, int(trees.number[row]))
         assert 10 * sum(story.sides) == pytest.approx(story.coverage_deg)
         assert story.column is not None
         assert story.column.verdict == "tree"
@@ -95,7 +95,7 @@ def test_what_is_not_there_is_refused_in_words(session: Session):
     with pytest.raises(StemmapError, match="no cluster 9999"):
         cluster_story(drive(session), frame, 9999)
     with pytest.raises(StemmapError, match="tree 9999 is not known"):
-        tree_story(drive(session), session.frame, 9999)
+        tree_story(drive(session), session.shown.frame, 9999)
 
 
 def test_a_preset_that_fits_no_circle_is_told_without_one(session: Session):

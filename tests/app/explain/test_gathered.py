@@ -82,12 +82,12 @@ def test_a_large_section_has_larger_cells_and_covers_the_same_places():
 
 
 def test_the_points_of_a_mapped_tree_are_on_its_fitted_circle(session: Session):
-    assert session.frame is not None
+    assert session.shown.frame is not None
     assert session.run is not None
     truth = session.run.source.truth()
     assert truth is not None
     assert truth.trees is not None
-    trees = session.frame.trees
+    trees = session.shown.frame.trees
     rows = np.flatnonzero(trees.confirmed & (trees.observations >= 10))
     errors = []
     for row in rows:
@@ -96,7 +96,7 @@ def test_the_points_of_a_mapped_tree_are_on_its_fitted_circle(session: Session):
         true = np.argmin(distance)
         if truth.trees.kind[true] != "tree" or distance[true] > 0.1:
             continue
-        story = tree_story(drive(session), session.frame, int(trees.number[row]))
+        story = tree_story(drive(session), session.shown.frame, int(trees.number[row]))
         points = np.array(story.points).reshape(-1, 3)
         at_breast = points[(points[:, 2] >= BREAST_LOW) & (points[:, 2] < BREAST_HIGH)]
         if len(at_breast) < 10:  # far away, every fourth scan is accumulated only

@@ -159,7 +159,7 @@ def test_the_best_picture_of_a_tree_is_one_that_shows_it(source: RosSource):
     session.play()
     while session.pace == "replay":
         session.work()
-    run, frame_ = session.run, session.frame
+    run, frame_ = session.run, session.shown.frame
     assert run is not None
     assert frame_ is not None
     shown = 0

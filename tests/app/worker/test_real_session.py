@@ -37,9 +37,9 @@ def stand_at(session: Session, index: int) -> Frame:
     session.advance(index - session.status().scan_index)
     while session.pace == "hurry":
         session.work()
-    assert session.frame is not None
-    assert session.frame.index == index
-    return session.frame
+    assert session.shown.frame is not None
+    assert session.shown.frame.index == index
+    return session.shown.frame
 
 
 def assert_same(a: Frame, b: Frame) -> None:
@@ -54,13 +54,13 @@ def assert_same(a: Frame, b: Frame) -> None:
 
 def test_the_real_mapper_comes_back_to_the_same_bytes(session: Session) -> None:
     first = {index: stand_at(session, index) for index in (8, 55, 60)}
-    path = session.path
+    path = session.shown.path
     for index in (8, 60, 55):
         assert_same(stand_at(session, index), first[index])
     stand_at(session, 60)
     assert path is not None
-    assert session.path is not None
-    np.testing.assert_array_equal(session.path.x, path.x)
+    assert session.shown.path is not None
+    np.testing.assert_array_equal(session.shown.path.x, path.x)
 
 
 def test_the_observed_area_is_that_of_the_command(session: Session, tmp_path: FilePath) -> None:
@@ -68,7 +68,7 @@ def test_the_observed_area_is_that_of_the_command(session: Session, tmp_path: Fi
     for index in (40, 10, 69):
         stand_at(session, index)
     assert session.run is not None
-    assert session.path is not None
+    assert session.shown.path is not None
     recorder = SeenRecorder()
     for stamp_ns, free in session.run.take_views():
         recorder.add(stamp_ns, free)
@@ -76,7 +76,7 @@ def test_the_observed_area_is_that_of_the_command(session: Session, tmp_path: Fi
     assert session.run.take_views() == []
     stand_at(session, 69)
     assert main(["map", URI, "--seed", "3", "--out", str(tmp_path / "out")]) == 0
-    assert seen_text(recorder.area(session.path)) == (tmp_path / "out" / "seen.csv").read_text()
+    assert seen_text(recorder.area(session.shown.path)) == (tmp_path / "out" / "seen.csv").read_text()
 
 
 def test_a_rerun_gives_the_course_of_the_new_map(session: Session) -> None:
@@ -132,9 +132,9 @@ def mapped(session: Session, scans: int) -> list[tuple[Frame, Path, Float]]:
     for _ in range(scans):
         frame = session.work()
         assert frame is not None
-        assert session.path is not None
-        assert session.confirmed_s is not None
-        results.append((frame, session.path, session.confirmed_s))
+        assert session.shown.path is not None
+        assert session.shown.confirmed_s is not None
+        results.append((frame, session.shown.path, session.shown.confirmed_s))
     session.pause()
     return results
 
@@ -143,13 +143,13 @@ def looked_at(session: Session, index: int) -> tuple[Frame, Path, Float]:
     """Seek a scan without mapping: what is shown of it at once."""
     shown = session.advance(index - session.status().scan_index)
     assert shown is not None
-    assert shown is session.frame
-    assert session.is_shown
+    assert shown is session.shown.frame
+    assert session.shown.is_stored
     assert session.status().scan_index == index
     assert session.status().going_to == ""
-    assert session.path is not None
-    assert session.confirmed_s is not None
-    return shown, session.path, session.confirmed_s
+    assert session.shown.path is not None
+    assert session.shown.confirmed_s is not None
+    return shown, session.shown.path, session.shown.confirmed_s
 
 
 def test_a_mapped_scan_is_shown_again_without_mapping(session: Session) -> None:
@@ -162,8 +162,8 @@ def test_a_mapped_scan_is_shown_again_without_mapping(session: Session) -> None:
     before = looked_at(session, 61)
     while session.pace == "hurry":
         session.work()
-    assert not session.is_shown
-    for old, new in zip(before[:2], (session.frame, session.path), strict=True):
+    assert not session.shown.is_stored
+    for old, new in zip(before[:2], (session.shown.frame, session.shown.path), strict=True):
         assert_equal(old, new)
     session.play()
     following = session.work()
@@ -179,12 +179,13 @@ def test_after_a_change_of_the_whole_run_its_scans_are_shown_with_the_new_map(se
     shown = looked_at(session, 30)[0]
     while session.pace == "hurry":
         session.work()
-    assert session.frame is not None
-    assert_equal(shown.clusters, session.frame.clusters)
-    assert_equal(shown.estimate, session.frame.estimate)
-    np.testing.assert_array_equal(shown.filtered, session.frame.filtered)
+    assert session.shown.frame is not None
+    assert_equal(shown.clusters, session.shown.frame.clusters)
+    assert_equal(shown.estimate, session.shown.frame.estimate)
+    np.testing.assert_array_equal(shown.filtered, session.shown.frame.filtered)
     np.testing.assert_array_equal(
-        shown.trees.number[shown.trees.confirmed], session.frame.trees.number[session.frame.trees.confirmed]
+        shown.trees.number[shown.trees.confirmed],
+        session.shown.frame.trees.number[session.shown.frame.trees.confirmed],
     )
 
 
@@ -192,7 +193,7 @@ def test_with_other_parameters_in_force_nothing_of_before_is_shown(session: Sess
     mapped(session, 30)
     session.set_parameters(Parameters().replace({"clustering.eps": 0.4}), 1)
     assert session.advance(-10) is None  # its scan is mapped with these parameters on arrival
-    assert not session.is_shown
+    assert not session.shown.is_stored
 
 
 def test_the_page_and_the_command_line_give_the_same_files(session: Session, tmp_path: FilePath) -> None:
@@ -209,18 +210,18 @@ def test_the_page_and_the_command_line_give_the_same_files(session: Session, tmp
     last = session.run.current
     for index in (20, last):  # the counts are those of the shown scan, also after the run went back
         stand_at(session, index)
-        assert session.counts is not None
-        assert sum(session.counts.health.values()) == index + 1
-    frame, truth = session.frame, session.run.source.truth()
+        assert session.shown.counts is not None
+        assert sum(session.shown.counts.health.values()) == index + 1
+    frame, truth = session.shown.frame, session.run.source.truth()
     assert frame is not None
     assert truth is not None
-    assert session.path is not None
+    assert session.shown.path is not None
     record = json.loads((out / "run.json").read_text())
-    shown = Shown(1, session.time_s, frame, 0, session.path, None, session.counts)
+    shown = Shown(1, session.shown.time_s, frame, 0, session.shown.path, None, session.shown.counts)
     request = SourceRequest(URI, seed=3)
-    start_ns = frame.stamp_ns - round(session.time_s * 1e9)
+    start_ns = frame.stamp_ns - round(session.shown.time_s * 1e9)
     run = ShownRun(
-        request, record["source"]["sha256"], session.status(), shown, session.path, start_ns, "forest",
+        request, record["source"]["sha256"], session.status(), shown, session.shown.path, start_ns, "forest",
         Parameters(), truth.trees, seen, (), None,
     )  # fmt: skip
     write_texts(there, run.texts())

@@ -83,7 +83,7 @@ def mapped_with(parameters: Parameters, last: int) -> tuple[object, object]:
 @cache
 def _mapped_once(parameters: str, last: int) -> tuple[object, object]:
     with mapped_from_start(Parameters.model_validate_json(parameters), last) as opened:
-        return told(opened.frame), told(opened.path)
+        return told(opened.shown.frame), told(opened.shown.path)
 
 
 def remapped(session: Session) -> tuple[Frame, MapChanges]:
@@ -101,7 +101,7 @@ def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters)
     session.set_parameters(parameters, 1, whole=True)
     assert session.is_remapping
     frame, changes = remapped(session)
-    assert (told(frame), told(session.path)) == mapped_with(parameters, current)
+    assert (told(frame), told(session.shown.path)) == mapped_with(parameters, current)
     assert changes.revision == 1
     assert changes.scans == current + 1
     assert session.status().remapped is None
@@ -135,18 +135,18 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
         session.set_parameters(wanted, revision, whole=True)
         frame, changes = remapped(session)
         assert changes.revision == revision
-        now: tuple[object, ...] = (told(frame), told(session.path))
-        now += (told(session._run.confirmed_s),)
+        now: tuple[object, ...] = (told(frame), told(session.shown.path))
+        now += (told(session.run.confirmed_s),)
         assert marks.setdefault(id(wanted), dict(changes.confirmed)) == dict(changes.confirmed)
         assert maps.setdefault(id(wanted), now) == now
     for wanted in (parameters, BASE, LATER):
         with mapped_from_start(wanted, LAST - 1) as other:
-            assert other.frame is not None
+            assert other.shown.frame is not None
             assert isinstance(other.run, Run)
             since = told(other.run.confirmed_s)
             confirmed = sorted(other.run._map.confirmed_s.values())
             assert sorted(marks[id(wanted)].values()) == confirmed, "those that went again too"
-            assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
+            assert maps[id(wanted)] == (told(other.shown.frame), told(other.shown.path), since)
 
 
 @pytest.mark.parametrize("parameters", [FEWER, WIDER])
@@ -166,7 +166,7 @@ def test_undo_and_redo_of_the_last_change_map_only_the_current_scan_again(sessio
         session.set_parameters(wanted, revision, whole=True)
         frame, _ = remapped(session)
         assert set(mapped) == {frame.index}
-        assert (told(frame), told(session.path)) == mapped_with(wanted, frame.index)
+        assert (told(frame), told(session.shown.path)) == mapped_with(wanted, frame.index)
 
 
 def places(frame: Frame) -> dict[int, tuple[float, float]]:
@@ -184,8 +184,8 @@ def test_trees_that_stay_keep_their_numbers():
         session.set_parameters(BASE, 0)
         session.advance(32)
         settle(session)
-        assert session.frame is not None
-        first = known = now = places(session.frame)
+        assert session.shown.frame is not None
+        first = known = now = places(session.shown.frame)
         assert len(known) > 20
         for revision, wanted in enumerate([FEWER, eps, none, few, LATER, JUDGED, BASE], 1):
             session.set_parameters(wanted, revision, whole=True)
@@ -204,11 +204,11 @@ def test_trees_that_stay_keep_their_numbers():
         assert now == first, "after undo"
         session.advance(1)
         settle(session)
-        assert session.frame is not None
-        assert places(session.frame).keys() >= first.keys()
+        assert session.shown.frame is not None
+        assert places(session.shown.frame).keys() >= first.keys()
         session.seek(2.5)
         settle(session)
-        earlier = places(session.frame).keys()  # trees that ended since then are among them
+        earlier = places(session.shown.frame).keys()  # trees that ended since then are among them
         assert len(earlier & first.keys()) > 0.9 * len(earlier)
 
 
@@ -220,7 +220,7 @@ def test_once_the_run_goes_on_a_map_that_was_left_is_made_again(session):
     settle(session)
     session.set_parameters(BASE, 3, whole=True)
     frame, _ = remapped(session)
-    assert (told(frame), told(session.path)) == mapped_with(BASE, frame.index)
+    assert (told(frame), told(session.shown.path)) == mapped_with(BASE, frame.index)
 
 
 @pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER])
@@ -230,7 +230,7 @@ def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parame
     for index in (6, 15):
         session.seek(0.1 * index)
         settle(session)
-        assert (told(session.frame), told(session.path)) == mapped_with(parameters, index)
+        assert (told(session.shown.frame), told(session.shown.path)) == mapped_with(parameters, index)
 
 
 def test_the_standing_scan_comes_first_then_the_preview_then_the_map(session, monkeypatch):
@@ -248,7 +248,7 @@ def test_the_standing_scan_comes_first_then_the_preview_then_the_map(session, mo
         frame = session.set_parameters(BASE.replace(change), revision, whole=True)
         assert frame is not None
         assert (segmented, heard) == ([frame.index], []), "nothing else is in the way of the answer"
-        rerun = session._run._remapping.rerun
+        rerun = session.run._remapping.rerun
         while not heard:
             assert session.remap() is None
             assert rerun.done <= 1
@@ -357,7 +357,7 @@ def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeyp
         session.set_parameters(wanted, revision, whole=True)
         frame, _ = remapped(session)
         assert set(mapped) == {frame.index}
-        assert (told(frame), told(session.path)) == mapped_with(wanted, frame.index)
+        assert (told(frame), told(session.shown.path)) == mapped_with(wanted, frame.index)
     session.seek(0.7)  # from a stored scan, or mapped again
     settle(session)
     assert told(session.run.map_again()) == mapped_with(wanted, 7)[0]
@@ -367,7 +367,7 @@ def test_where_all_scans_are_stored_the_source_is_not_read(session, monkeypatch)
     def nothing() -> Iterator[Step]:
         raise AssertionError("the source is read")
 
-    monkeypatch.setattr(session._run._cursor, "_read", nothing)
+    monkeypatch.setattr(session.run._cursor, "_read", nothing)
     session.set_parameters(WIDER, 1, whole=True)
     frame, _ = remapped(session)
     assert told(frame) == mapped_with(WIDER, frame.index)[0]
@@ -429,7 +429,7 @@ def test_where_other_trees_close_another_loop_the_whole_run_is_mapped_again(sess
     monkeypatch.setattr(TreeRerun, "map_next", differs)
     session.set_parameters(LATER, 1, whole=True)
     frame, _ = remapped(session)
-    assert (told(frame), told(session.path)) == mapped_with(LATER, frame.index)
+    assert (told(frame), told(session.shown.path)) == mapped_with(LATER, frame.index)
 
 
 def test_what_is_no_part_of_the_map_begins_nothing(session):
@@ -438,19 +438,19 @@ def test_what_is_no_part_of_the_map_begins_nothing(session):
 
 
 def test_what_cannot_be_read_again_leaves_the_map_and_says_so(session, monkeypatch):
-    run = session._run
-    before = told(session.frame)
+    run = session.run
+    before = told(session.shown.frame)
 
     def nothing(_index: int) -> Iterator[object]:
         raise SourceError("the disk is gone")
 
     monkeypatch.setattr(run._cursor, "again", nothing)
     session.set_parameters(WIDER, 1)
-    at_hand = told(session.frame)
+    at_hand = told(session.shown.frame)
     session.set_parameters(WIDER, 2, whole=True)
     while session.is_remapping:
         assert session.remap() is None
-    assert told(session.frame) == at_hand != before
+    assert told(session.shown.frame) == at_hand != before
     assert any("was not mapped again" in w and "the disk is gone" in w for w in session.status().warnings)
 
 
@@ -460,7 +460,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
         session.set_parameters(BASE, 0)
         session.advance(120)
         settle(session)
-        frame = session.frame
+        frame = session.shown.frame
         assert frame is not None
         known = int(np.count_nonzero(frame.trees.confirmed))
         assert known >= 2
@@ -509,7 +509,7 @@ def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(session._run._remapping.rerun.mapper, "process", broken)
+    monkeypatch.setattr(session.run._remapping.rerun.mapper, "process", broken)
     with pytest.raises(ZeroDivisionError):
         session.remap()
     assert not session.is_remapping

@@ -33,7 +33,7 @@ def settle(session: Session) -> Frame | None:
     """Work until nothing is sought any more."""
     while session.pace == "hurry":
         session.work()
-    return session.frame
+    return session.shown.frame
 
 
 def opened(scans: int = SCANS, **source: object) -> Session:
@@ -57,8 +57,8 @@ def played(eps_of: dict[int, float], last: int) -> float:
 
 
 def checksum(session: Session) -> float:
-    assert session.frame is not None
-    return session.frame.estimate.T_map_base.x
+    assert session.shown.frame is not None
+    return session.shown.frame.estimate.T_map_base.x
 
 
 @pytest.mark.parametrize("index", [0, 1, 49, 50, 51, 100, 129])
@@ -70,8 +70,8 @@ def test_seeking_gives_what_playing_gives(index: int) -> None:
     settle(session)
     assert session.status().scan_index == index
     assert checksum(session) == played({}, index)
-    assert session.path is not None
-    assert len(session.path.x) == index + 1
+    assert session.shown.path is not None
+    assert len(session.shown.path.x) == index + 1
 
 
 def test_seeking_forward_again_uses_what_is_known_and_gives_the_same() -> None:
@@ -95,7 +95,7 @@ def test_a_change_on_the_standing_scan_counts_it_once() -> None:
     settle(session)
     for eps in (0.3, 0.7, 0.4):
         shown = session.set_parameters(parameters(eps), 1)
-        assert shown is session.frame
+        assert shown is session.shown.frame
         assert checksum(session) == played({30: eps}, 30)
     session.advance(1)
     settle(session)
@@ -179,7 +179,7 @@ def test_whatever_is_done_the_picture_is_that_of_a_plain_run(done: list[tuple[st
             for _ in range(int(value)):
                 session.work()
                 if session.status().state == "playing":
-                    assert session.frame is not None
+                    assert session.shown.frame is not None
             session.pause()
             model.current = session.status().scan_index
         else:
@@ -340,8 +340,8 @@ def test_counts_of_the_last_scan_are_known_while_it_waits_for_other_parameters()
     shown = settle(session)
     assert shown is not None
     assert shown.index == 6
-    assert session.counts is not None
-    assert sum(session.counts.health.values()) == 7
+    assert session.shown.counts is not None
+    assert sum(session.shown.counts.health.values()) == 7
 
 
 def test_a_fault_in_the_mapper_is_survived_by_playing_anew() -> None:
@@ -412,7 +412,7 @@ def test_opening_another_source_closes_the_first() -> None:
     assert session.status().source == "missing:"
     session.open(Open("fake:", "auto", 0))
     assert session.status().state == "paused"
-    assert session.frame is None
+    assert session.shown.frame is None
 
 
 def test_a_source_that_gives_other_scans_the_second_time_goes_back_where_its_steps_are_stored() -> None:
@@ -540,15 +540,15 @@ def test_a_fault_in_a_repair_is_its_problem_and_the_map_is_shown_without_it(
     session = opened()
     session.advance(3)
     settle(session)
-    before = session.frame
+    before = session.shown.frame
 
     def failing(*_: Any, **__: Any) -> RepairedMap:
         raise error("singular")
 
     monkeypatch.setattr(Repairer, "repaired", failing)
-    assert session.set_repairs((TIE,)) is before
-    assert session.repaired is not None
-    assert "singular" in session.repaired.problems[0]
+    assert session.shown.set_repairs((TIE,)) is before
+    assert session.shown.repaired is not None
+    assert "singular" in session.shown.repaired.problems[0]
     assert session.status().scan_index == 2
 
 
@@ -571,20 +571,20 @@ def test_a_pause_repairs_the_loops_of_the_shown_scan_by_their_own_solution(
     session, calls = opened(), noted(monkeypatch)
     session.play()
     session.work()
-    session.set_repairs((TIE,))
+    session.shown.set_repairs((TIE,))
     before = calls[-1]
-    assert session.pause() is session.frame
+    assert session.pause() is session.shown.frame
     assert (before[1], calls[-1][1]) == (True, False)
     assert session.pause() is None, "it is shown already"
 
 
 def test_the_last_scan_of_a_played_run_has_its_own_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     session, calls = opened(3), noted(monkeypatch)
-    session.set_repairs((TIE,))
+    session.shown.set_repairs((TIE,))
     session.play()
     while session.pace != "idle":
         session.work()
-        assert session.frame is not None
+        assert session.shown.frame is not None
     assert not calls[-1][1]
 
 
@@ -592,9 +592,9 @@ def test_other_parameters_repair_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     session, calls = opened(), noted(monkeypatch)
     session.advance(3)
     settle(session)
-    session.set_repairs((TIE,))
+    session.shown.set_repairs((TIE,))
     session.set_parameters(parameters(0.5), 1)
-    assert session.frame is not None
+    assert session.shown.frame is not None
     assert calls[0][0] is not calls[-1][0]
 
 
@@ -603,6 +603,6 @@ def test_a_tie_acts_while_a_stored_scan_is_shown() -> None:
     session.seek(12.0)
     settle(session)
     session.seek(1.0)
-    before = session.is_shown
-    session.set_repairs((TIE,))
-    assert (before, session.is_shown) == (True, False)
+    before = session.shown.is_stored
+    session.shown.set_repairs((TIE,))
+    assert (before, session.shown.is_stored) == (True, False)

@@ -54,16 +54,16 @@ def mapped(session: Session) -> Frame:
     session.play()
     while session.pace != "idle":
         session.work()
-    assert session.frame is not None
-    return session.frame
+    assert session.shown.frame is not None
+    return session.shown.frame
 
 
 def again(session: Session) -> Frame:
     """Continue until the inventory that replaces the map is complete."""
     while session.is_remapping:
         session.remap()
-    assert session.frame is not None
-    return session.frame
+    assert session.shown.frame is not None
+    return session.shown.frame
 
 
 def cloud_run(session: Session) -> OneStepRun:
@@ -92,8 +92,8 @@ def test_a_cloud_is_mapped_in_steps_without_a_robot(session: Session) -> None:
     assert "26912" in status.one_step.crs
     assert status.one_step.parameters == list(PARAMETERS)
     assert set(PARAMETERS) <= set(FOREST.flat())
-    assert session.path is not None
-    assert len(session.path.x) == 0
+    assert session.shown.path is not None
+    assert len(session.shown.path.x) == 0
 
 
 def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session) -> None:
@@ -113,14 +113,14 @@ def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session
             < 0.5
         )
     codec = from_worker()
-    assert session.path is not None
-    shown = Shown(1, 0.0, picture_of(frame), 0, session.path, None, session.counts)
+    assert session.shown.path is not None
+    shown = Shown(1, 0.0, picture_of(frame), 0, session.shown.path, None, session.shown.counts)
     there = codec.decode(codec.encode(shown)[4:])
     assert isinstance(there, Shown)
     assert there.counts is not None
-    assert session.counts is not None
-    np.testing.assert_array_equal(there.counts.covered, session.counts.covered)
-    assert replace(there.counts, covered=None) == replace(session.counts, covered=None)
+    assert session.shown.counts is not None
+    np.testing.assert_array_equal(there.counts.covered, session.shown.counts.covered)
+    assert replace(there.counts, covered=None) == replace(session.shown.counts, covered=None)
     assert there.counts.verdicts["tree"] == len(PLACES)
     assert not there.frame.of_drive
     np.testing.assert_array_equal(there.frame.trees.lean, frame.trees.lean)
@@ -151,7 +151,7 @@ def test_a_parameter_of_the_inventory_maps_the_cloud_again_and_keeps_the_numbers
     before = mapped(session)
     session.set_parameters(FOREST.replace({"detection.radius_min": 0.13}), 2)
     assert session.is_remapping
-    assert session.frame is before, "the old map is shown until the new one is complete"
+    assert session.shown.frame is before, "the old map is shown until the new one is complete"
     after = again(session)
     thick = set(before.trees.number[PLACES[nearest(before), 2] > 0.135].tolist())
     assert set(after.trees.number.tolist()) == thick
@@ -181,7 +181,7 @@ def test_other_parameters_do_not_map_the_cloud_again(session: Session) -> None:
     before = mapped(session)
     session.set_parameters(FOREST.replace({"clustering.eps": 0.5, "slam.distance_max": 2.0}), 2)
     assert not session.is_remapping
-    assert session.frame is before
+    assert session.shown.frame is before
 
 
 def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session: Session) -> None:
@@ -244,7 +244,7 @@ def test_two_sets_are_compared_without_a_change_of_the_map(session: Session) -> 
     before = mapped(session)
     few, all_of_them = session.compare([FOREST.replace({"detection.radius_min": 0.2}), FOREST])
     assert len(few.trees.number) < len(all_of_them.trees.number) == len(PLACES)
-    assert session.frame is before
+    assert session.shown.frame is before
 
 
 def test_a_seek_or_another_play_leaves_the_map_as_it_is(session: Session) -> None:
@@ -252,11 +252,11 @@ def test_a_seek_or_another_play_leaves_the_map_as_it_is(session: Session) -> Non
     session.seek(5.0)
     while session.pace == "hurry":
         session.work()
-    assert session.frame is before
+    assert session.shown.frame is before
     session.play()
     while session.pace != "idle":
         session.work()
-    assert session.frame is before
+    assert session.shown.frame is before
 
 
 def test_a_damaged_cloud_is_refused_and_the_address_of_a_drive_is_no_map(cloud: Path, tmp_path: Path) -> None:
@@ -278,5 +278,5 @@ def test_a_run_of_scans_follows_a_cloud(session: Session) -> None:
     session.advance(1)
     while session.pace == "hurry":
         session.work()
-    assert session.frame is not None
-    assert session.frame.of_drive
+    assert session.shown.frame is not None
+    assert session.shown.frame.of_drive
