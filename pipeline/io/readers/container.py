@@ -106,6 +106,15 @@ class Container:
         read are left out. SourceError if the file cannot be read."""
         return self.messages(numbers, self.tail_ns(numbers, count), {})
 
+    def spread(self, numbers: Collection[int], most: int) -> Iterator[Message]:
+        """Yield messages of some channels that are evenly spaced over the recording, at most `most`; those
+        that cannot be read are left out. SourceError if the file cannot be read."""
+        rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
+        for k in np.unique(np.linspace(0, max(len(rows) - 1, 0), min(most, len(rows))).astype(np.int64)):
+            message = self._message(*self.index[rows[k]].tolist())
+            if message is not None:
+                yield replace(message, payload=plain(message.payload))
+
     def tail_ns(self, numbers: Collection[int], last: int = TAIL) -> int:
         """Return the time of recording [ns] of the `last` message from the end of some channels, of the first
         one if there are fewer; 0 if there is none."""

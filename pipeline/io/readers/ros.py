@@ -23,6 +23,7 @@ from pipeline.io.readers.ros_messages import Content, TimedMessages
 from pipeline.io.readers.ros_mounting import find_mounting
 from pipeline.io.readers.ros_odometry import choose_odometry, first_frames, nearness
 from pipeline.io.readers.ros_records import RecordDecoder
+from pipeline.io.readers.ros_tilt import TiltCheck, check_tilt
 from pipeline.io.readers.scan_columns import (
     FARTHEST_MEDIAN,
     NO_METRES,
@@ -173,9 +174,17 @@ class RosSource(MessageSource):
         if sensor.rings and rings_descend(first):
             reader = replace(reader, top_ring=sensor.rings - 1)
         decoder.levels = _is_upright(messages, decoder)
+        tilt = TiltCheck()
+        if not live and not odometry.world and sensor.rings != 1:
+            is_recorded = tree.find(mounting.base, found.frame) is not None
+            is_recorded = is_recorded and not mounting.is_measured and options.T_base_lidar is None
+            tilt = check_tilt(messages, decoder, found.frame, T_base_lidar, is_recorded=is_recorded)
+        if tilt.scans:
+            count_loss(self._damage, tilt.reason, tilt.scans)
         opening = RosOpening(messages, tree, frames, decoder, times, mounting, sensor, first, is_cut)
-        warnings = (*odometry.warnings, *spoilt, *times.warnings, *mounting.warnings)
+        warnings = (*odometry.warnings, *spoilt, *times.warnings, *mounting.warnings, *tilt.warnings)
         described = describe(opening, uri, digest_of(paths), warnings)
+        decoder.levels = decoder.levels and tilt.uses_imu
         self._alignments = FrameAlignments(decoder, messages)
         self._description = self._alignments.begin(described, live=live)
         self.notices = self._alignments.notices

@@ -166,7 +166,7 @@ def _mounting_by_motion(
         level: T_base_lidar by the ground in the first scan, None for an upright LiDAR.
     """
     # Compiled kernels and SciPy, which a process that only records or serves does not need.
-    from pipeline.odometry.mounting_yaw import lidar_path, overlap, yaw_of_mounting
+    from pipeline.odometry.mounting_yaw import better_yaw, lidar_path, overlap, yaw_of_mounting
 
     times_ns, path = _odometry_path(messages, decoder)
     if len(times_ns) < 2:
@@ -184,14 +184,15 @@ def _mounting_by_motion(
     found = yaw_of_mounting(by_scans, at)
     if found is None or overlap(by_scans, points) < _SAME_WORLD:
         return _Motion(level, 0, warnings)
-    degrees = round(float(np.degrees(found.yaw))) % 360
+    yaw = better_yaw(found.yaw, at, points)
+    degrees = round(float(np.degrees(yaw))) % 360
     if found.contradicts or not degrees:
         return _Motion(level, len(scans) if found.contradicts else 0, warnings)
     text = (
         f"by the motion of the scans beside the odometry over {found.length:.0f} m, the yaw of the mounting "
         f"is {degrees} degrees; --mount overrides this"
     )
-    T_base_lidar = Pose3.from_euler(np.zeros(3), 0.0, 0.0, found.yaw) @ (level or Pose3.identity())
+    T_base_lidar = Pose3.from_euler(np.zeros(3), 0.0, 0.0, yaw) @ (level or Pose3.identity())
     return _Motion(T_base_lidar, 0, (*warnings, text))
 
 

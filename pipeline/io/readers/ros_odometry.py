@@ -3,17 +3,21 @@ none."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile
 
+from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import Container
 from pipeline.io.readers.message_time import header_frame
 from pipeline.io.readers.topics import ODOMETRY, TYPES_BY_ROLE, Topic, Topics, decode
-from pipeline.io.readers.transforms import Extrinsics, Link, TransformTree, frame_name
+from pipeline.io.readers.transforms import USUAL_BASES, Extrinsics, Link, TransformTree, frame_name
 
 #: Number of scans among which a frame is looked for that the fixed transforms know.
 _TRIES = 20
+#: Cosine of the largest angle between the z axis of an upright LiDAR and the vertical.
+_UPRIGHT = math.cos(math.radians(45.0))
 
 #: Dict from names of topics to `frame_id` and `child_frame_id` of their first messages.
 Frames = Mapping[str, tuple[str, str]]
@@ -55,9 +59,11 @@ def nearness(
     tree: TransformTree, frames: Frames, role: str, topic: Topic, scans: Topic | None
 ) -> tuple[int, ...]:
     """Return how surely a topic belongs to the LiDAR, see `choose_topics`: for scans, whether they are in a
-    frame of the robot, and whether fixed transforms have that frame; for others, whether fixed transforms
-    link them to the LiDAR, and the number of parts that their names, and those of their frames, have in
-    common with those of the scans.
+    frame of the robot, whether fixed transforms have that frame, and whether its z axis is nearer to the
+    vertical than to the horizontal: a LiDAR that turns about a horizontal axis, and the optical frame of a
+    depth camera, see few trunks again in the next scan. For others, whether fixed transforms link them to
+    the LiDAR, and the number of parts that their names, and those of their frames, have in common with those
+    of the scans.
 
     Args:
         tree: Fixed transforms.
@@ -68,7 +74,11 @@ def nearness(
     frame, child = frames[topic.name]
     if scans is None:
         maps = {parent for name, (parent, robot) in frames.items() if robot and name != topic.name}
-        return int(frame not in maps), int(tree.knows(frame))
+        robots = (*(child for _, child in frames.values() if child), *USUAL_BASES)
+        placed = (T for robot in robots if robot != frame and (T := tree.find(robot, frame)) is not None)
+        T_base_lidar = next(placed, Pose3.identity())
+        is_upright = abs(T_base_lidar.R[2, 2]) > _UPRIGHT
+        return int(frame not in maps), int(tree.knows(frame)), int(is_upright)
     lidar, place = frames[scans.name][0], child or frame
     linked = bool(lidar and place) and (tree.find(place, lidar) is not None or lidar == frame)
     return int(linked), _in_common(topic.name, scans.name), _in_common(place, lidar)

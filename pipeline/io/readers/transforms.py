@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 FARTHEST = 1e9
 
 
+#: Usual names of the frame of a robot.
+USUAL_BASES = ("base_link", "base_footprint", "base")
+
+
 class TransformTree:
     """Fixed transforms between frames. Names are compared exactly; callers remove leading slashes by
     `frame_name`."""
@@ -185,7 +189,7 @@ class Extrinsics:
             by_odometry: Frames of the robot by the odometry.
             lidar: Frame of the LiDAR.
         """
-        usual = [name for name in ("base_link", "base_footprint", "base") if self.tree.knows(name)]
+        usual = [name for name in USUAL_BASES if self.tree.knows(name)]
         names = [name for name in (*by_odometry, *usual) if name]
         linked = (name for name in names if lidar and self.tree.find(name, lidar) is not None)
         return next(linked, next(iter(names), ""))

@@ -1,0 +1,178 @@
+"""Whether the levelled scans of a ROS recording stand upright: the fixed transforms and the orientation of
+the IMU are checked against the ground and the trunks of some scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.ros_messages import TimedMessages
+from pipeline.io.readers.ros_records import RecordDecoder
+from pipeline.types.records import Float, Imu, Scan
+
+#: Scans that are checked, evenly spaced over the recording: a slope changes on the way, the axes of a sensor
+#: do not.
+_SCANS, _FEWEST = 8, 5
+#: Largest age of the reading of an IMU [ns].
+_STALE_NS = 500_000_000
+#: Least angle between gravity and the mean of trunks that shows wrong axes, and largest angle of single
+#: scans to the mean [rad]. Trunks of one scan lean by 1 to 4 degrees on average; those on a slope are upright.
+_TILTED, _ALIKE = np.radians(8.0), np.radians(6.0)
+#: Trunks are upright within this [rad].
+_UPRIGHT = np.radians(4.0)
+#: Largest distance of points of the ground, side of the cells of which the lowest points are taken [m], fewest
+#: cells, height above the plane up to which a lowest point is ground [m], and turns of the fit.
+_NEAR, _CELL, _CELLS, _EVEN, _TURNS = 8.0, 1.0, 20, 0.15, 5
+
+
+@dataclass(frozen=True, slots=True)
+class TiltCheck:
+    """What ground and trunks say about the levelling of the scans.
+
+    Attributes:
+        scans: Number of scans that contradict the fixed transforms, or these and the IMU; 0 for none.
+        reason: Why they do, and what helps; "" without contradiction.
+        uses_imu: Whether the orientation of the IMU can be used.
+        warnings: Messages for the user.
+    """
+
+    scans: int = 0
+    reason: str = ""
+    uses_imu: bool = True
+    warnings: tuple[str, ...] = ()
+
+
+def check_tilt(
+    messages: TimedMessages, decoder: RecordDecoder, lidar: str, T_base_lidar: Pose3, *, is_recorded: bool
+) -> TiltCheck:
+    """Check the tilt of the mounting by the ground, on which the robot stands, and gravity by the IMU by the
+    trunks, which are vertical on average.
+
+    Args:
+        messages, decoder: The messages and their decoder, with the base frame.
+        lidar: Frame of the LiDAR.
+        T_base_lidar: Mounting of the LiDAR.
+        is_recorded: Whether the mounting is that of fixed transforms.
+    """
+    numbers = messages.odometry.topics.numbers("scan")
+    found = [m for m in messages.container.spread(numbers, _SCANS) if messages.frame_of(m) == lidar]
+    records = [(m.log_ns, decoder.record(m, 0, {})) for m in found]
+    scans = [
+        (log_ns, scan.points.astype(np.float64) @ T_base_lidar.R.T)
+        for log_ns, scan in records
+        if isinstance(scan, Scan) and len(scan.points)
+    ]
+    grounds = [ground for _, points in scans if (ground := _ground_of(points)) is not None]
+    if is_recorded and (tilt := _common_tilt(grounds)):
+        return TiltCheck(
+            messages.odometry.topics.chosen["scan"].count,
+            f"scans in which the ground below the robot is tilted by {np.degrees(tilt):.0f} degrees in the "
+            "same direction throughout the drive: the fixed transform of the LiDAR is wrong; give its pose "
+            "with --mount",
+        )
+    return _check_imu(messages, decoder, scans)
+
+
+def _check_imu(messages: TimedMessages, decoder: RecordDecoder, scans: list[tuple[int, Float]]) -> TiltCheck:
+    """Return what the trunks in scans, points in the base frame with the time of recording [ns], say about
+    the orientation of the IMU."""
+    numbers, trunks, leaning = messages.odometry.topics.numbers("imu"), list[Float](), list[Float]()
+    for log_ns, points in scans:
+        R_level_base = _levelling_near(messages, decoder, numbers, log_ns)
+        if R_level_base is None:
+            continue
+        up = _up_of(points @ R_level_base.T)
+        if up is not None:
+            leaning.append(up)
+            trunks.append(R_level_base.T @ up)
+    lean = _common_tilt(leaning)
+    if not lean:
+        return TiltCheck()
+    name = messages.odometry.topics.chosen["imu"].name
+    degrees = f"{np.degrees(lean):.0f} degrees"
+    mean = np.mean(trunks, axis=0)
+    if mean[2] > np.cos(_UPRIGHT) * np.linalg.norm(mean):
+        return TiltCheck(
+            uses_imu=False,
+            warnings=(
+                f"by the orientation in {name} all trunks would lean by {degrees}, which they do not without "
+                "it: it is not used (the fixed transform of its frame is wrong or missing)",
+            ),
+        )
+    return TiltCheck(
+        messages.odometry.topics.chosen["scan"].count,
+        f"scans whose trunks lean by {degrees} in the same direction throughout the drive, by the "
+        f"orientation in {name}: it or the fixed transforms are wrong; give the pose of the LiDAR with --mount",
+    )
+
+
+def _levelling_near(
+    messages: TimedMessages, decoder: RecordDecoder, numbers: frozenset[int], log_ns: int
+) -> Float | None:
+    """Return R_level_base by the first orientation of the IMU that is recorded after a time [ns]; None if
+    there is none within _STALE_NS."""
+    for message in messages.container.messages(numbers, log_ns, {}):
+        if message.log_ns > log_ns + _STALE_NS:
+            return None
+        reading = decoder.record(message, 0, {})
+        if isinstance(reading, Imu) and reading.orientation is not None:
+            roll, pitch, _ = Pose3.from_quaternion(np.zeros(3), reading.orientation).euler()
+            return Pose3.from_euler(np.zeros(3), roll, pitch, 0.0).R
+    return None
+
+
+def _up_of(points: Float) -> Float | None:
+    """Return the vertical by the trunks in a scan, shape (3,), None if they do not show it.
+
+    Args:
+        points: Points about the sensor, z within 30 degrees of the vertical, shape (N, 3) [m].
+    """
+    from pipeline.odometry.lidar_odometry import BARK, vertical_of
+    from pipeline.odometry.mounting_yaw import standing_height
+
+    near, height = standing_height(points)
+    return vertical_of(near[(height > BARK[0]) & (height < BARK[1])])
+
+
+def _ground_of(points: Float) -> Float | None:
+    """Return the normal of the ground about the sensor, upwards, shape (3,), None without trunks or ground.
+
+    The ground is the plane through the lowest points of cells that are level by the trunks.
+
+    Args:
+        points: As in `_up_of`.
+    """
+    from pipeline.odometry.lidar_odometry import levelling
+
+    up = _up_of(points)
+    if up is None:
+        return None
+    R = levelling(up)
+    level = points[np.linalg.norm(points, axis=1) < _NEAR] @ R.T
+    cell = np.floor(level[:, :2] / _CELL).astype(np.int64)
+    order = np.lexsort((level[:, 2], cell[:, 1], cell[:, 0]))
+    cell, lowest = cell[order], level[order]
+    lowest = lowest[np.concatenate(([True], (np.diff(cell, axis=0) != 0).any(axis=1)))]
+    kept, plane = np.ones(len(lowest), np.bool_), np.zeros(3)
+    A = np.column_stack([lowest[:, :2], np.ones(len(lowest))])
+    for _ in range(_TURNS):  # cells without ground have higher lowest points
+        if np.count_nonzero(kept) < _CELLS:
+            return None
+        plane = np.linalg.lstsq(A[kept], lowest[kept, 2], rcond=None)[0]
+        off = lowest[:, 2] - A @ plane
+        kept = off < max(float(np.median(off[kept])) + _EVEN, _EVEN)
+    normal = np.array([-plane[0], -plane[1], 1.0]) @ R
+    return normal / np.linalg.norm(normal)
+
+
+def _common_tilt(ups: list[Float]) -> float:
+    """Return the angle between the z axis and the mean of unit vectors [rad]; 0 if it is less than _TILTED,
+    the vectors are fewer than _FEWEST, or one of them is farther than _ALIKE from the mean."""
+    if len(ups) < _FEWEST:
+        return 0.0
+    mean = np.mean(ups, axis=0) / np.linalg.norm(np.mean(ups, axis=0))
+    tilt = float(np.arccos(np.clip(mean[2], -1.0, 1.0)))
+    is_alike = bool((np.array(ups) @ mean > np.cos(_ALIKE)).all())
+    return tilt if tilt >= _TILTED and is_alike else 0.0
