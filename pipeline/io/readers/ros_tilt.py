@@ -18,11 +18,11 @@ _SCANS, _FEWEST = 8, 5
 #: Largest age of the reading of an IMU [ns].
 _STALE_NS = 500_000_000
 #: Least angle between gravity and the mean of trunks that shows wrong axes, and largest angle of single
-#: scans to the mean [rad]. Trunks of one scan lean by 1 to 4 degrees on average; those on a slope are upright.
+#: scans to the mean [rad]. Trunks of a scan lean by 1 to 4 degrees on average, also on a slope.
 _TILTED, _ALIKE = np.radians(8.0), np.radians(6.0)
 #: Trunks are upright within this [rad].
 _UPRIGHT = np.radians(4.0)
-#: Largest distance of points of the ground, side of the cells of which the lowest points are taken [m], fewest
+#: Largest distance of points of the ground, side of cells of which the lowest points are taken [m], fewest
 #: cells, height above the plane up to which a lowest point is ground [m], and turns of the fit.
 _NEAR, _CELL, _CELLS, _EVEN, _TURNS = 8.0, 1.0, 20, 0.15, 5
 
@@ -104,7 +104,8 @@ def _check_imu(messages: TimedMessages, decoder: RecordDecoder, scans: list[tupl
     return TiltCheck(
         messages.odometry.topics.chosen["scan"].count,
         f"scans whose trunks lean by {degrees} in the same direction throughout the drive, by the "
-        f"orientation in {name}: it or the fixed transforms are wrong; give the pose of the LiDAR with --mount",
+        f"orientation in {name}: it or the fixed transforms are wrong; give the pose of the LiDAR with "
+        "--mount",
     )
 
 
@@ -146,11 +147,11 @@ def _ground_of(points: Float) -> Float | None:
     """
     from pipeline.odometry.lidar_odometry import levelling
 
-    up = _up_of(points)
-    if up is None:
+    near, up = points[np.linalg.norm(points, axis=1) < _NEAR], _up_of(points)
+    if up is None or len(near) < _CELLS:
         return None
     R = levelling(up)
-    level = points[np.linalg.norm(points, axis=1) < _NEAR] @ R.T
+    level = near @ R.T
     cell = np.floor(level[:, :2] / _CELL).astype(np.int64)
     order = np.lexsort((level[:, 2], cell[:, 1], cell[:, 0]))
     cell, lowest = cell[order], level[order]
