@@ -17,13 +17,14 @@ from pipeline.io.readers.camera import MessageSource
 from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.measured_poses import Fix, FrameAlignments
 from pipeline.io.readers.message_time import Stamped, in_order_of_stamps
+from pipeline.io.readers.robot_body import body_words
 from pipeline.io.readers.ros_description import RosOpening, describe
 from pipeline.io.readers.ros_first_scans import find_first_scan, times_of_topic
 from pipeline.io.readers.ros_messages import Content, TimedMessages
 from pipeline.io.readers.ros_mounting import find_mounting
 from pipeline.io.readers.ros_odometry import choose_odometry, first_frames, nearness
 from pipeline.io.readers.ros_records import RecordDecoder
-from pipeline.io.readers.ros_tilt import TiltCheck, check_tilt
+from pipeline.io.readers.ros_tilt import TiltCheck, check_tilt, spread_scans
 from pipeline.io.readers.scan_columns import (
     FARTHEST_MEDIAN,
     NO_METRES,
@@ -174,15 +175,17 @@ class RosSource(MessageSource):
         if sensor.rings and rings_descend(first):
             reader = replace(reader, top_ring=sensor.rings - 1)
         decoder.levels = _is_upright(messages, decoder)
-        tilt = TiltCheck()
+        tilt, body = TiltCheck(), tuple[str, ...]()
         if not live and not odometry.world and sensor.rings != 1:
             is_recorded = tree.find(mounting.base, found.frame) is not None
             is_recorded = is_recorded and not mounting.is_measured and options.T_base_lidar is None
-            tilt = check_tilt(messages, decoder, found.frame, T_base_lidar, is_recorded=is_recorded)
+            scans_of_run = spread_scans(messages, decoder, found.frame, T_base_lidar)
+            tilt = check_tilt(messages, decoder, scans_of_run, is_recorded=is_recorded)
+            body = body_words([points for _, points in scans_of_run])
         if tilt.scans:
             count_loss(self._damage, tilt.reason, tilt.scans)
         opening = RosOpening(messages, tree, frames, decoder, times, mounting, sensor, first, is_cut)
-        warnings = (*odometry.warnings, *spoilt, *times.warnings, *mounting.warnings, *tilt.warnings)
+        warnings = (*odometry.warnings, *spoilt, *times.warnings, *mounting.warnings, *tilt.warnings, *body)
         described = describe(opening, uri, digest_of(paths), warnings)
         decoder.levels = decoder.levels and tilt.uses_imu
         self._alignments = FrameAlignments(decoder, messages)

@@ -44,26 +44,37 @@ class TiltCheck:
     warnings: tuple[str, ...] = ()
 
 
+def spread_scans(
+    messages: TimedMessages, decoder: RecordDecoder, lidar: str, T_base_lidar: Pose3
+) -> list[tuple[int, Float]]:
+    """Return times of recording [ns] and points of up to _SCANS scans, evenly spaced over the recording,
+    about the sensor with the axes of the base, shape (N, 3) each [m]. SourceError if the file cannot be read.
+
+    Args:
+        messages, decoder: The messages and their decoder.
+        lidar: Frame of the LiDAR; scans of others are left out.
+        T_base_lidar: Mounting of the LiDAR.
+    """
+    found = messages.container.spread(messages.odometry.topics.numbers("scan"), _SCANS)
+    records = [(m.log_ns, decoder.record(m, 0, {})) for m in found if messages.frame_of(m) == lidar]
+    return [
+        (log_ns, scan.points.astype(np.float64) @ T_base_lidar.R.T)
+        for log_ns, scan in records
+        if isinstance(scan, Scan) and len(scan.points)
+    ]
+
+
 def check_tilt(
-    messages: TimedMessages, decoder: RecordDecoder, lidar: str, T_base_lidar: Pose3, *, is_recorded: bool
+    messages: TimedMessages, decoder: RecordDecoder, scans: list[tuple[int, Float]], *, is_recorded: bool
 ) -> TiltCheck:
     """Check the tilt of the mounting by the ground, on which the robot stands, and gravity by the IMU by the
     trunks, which are vertical on average.
 
     Args:
         messages, decoder: The messages and their decoder, with the base frame.
-        lidar: Frame of the LiDAR.
-        T_base_lidar: Mounting of the LiDAR.
+        scans: From `spread_scans`.
         is_recorded: Whether the mounting is that of fixed transforms.
     """
-    numbers = messages.odometry.topics.numbers("scan")
-    found = [m for m in messages.container.spread(numbers, _SCANS) if messages.frame_of(m) == lidar]
-    records = [(m.log_ns, decoder.record(m, 0, {})) for m in found]
-    scans = [
-        (log_ns, scan.points.astype(np.float64) @ T_base_lidar.R.T)
-        for log_ns, scan in records
-        if isinstance(scan, Scan) and len(scan.points)
-    ]
     grounds = [ground for _, points in scans if (ground := _ground_of(points)) is not None]
     if is_recorded and (tilt := _common_tilt(grounds)):
         return TiltCheck(
