@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from datetime import date
 from itertools import islice
@@ -20,7 +21,7 @@ from pipeline.errors import StemmapError
 from tests.benchmarks import process, recorded, runner
 from tests.benchmarks.__main__ import main
 from tests.benchmarks.campaign import Result
-from tests.benchmarks.cases import campaign
+from tests.benchmarks.cases import campaign, rivals
 from tests.benchmarks.cases.peer import Comparison, compare
 from tests.benchmarks.peer.fastslam import FastSlam, Landmark, Particle, resample
 from tests.benchmarks.peer.stages import Detection, detect
@@ -246,6 +247,19 @@ def test_both_sides_map_the_same_scans() -> None:
     ours, peers = (str(row[1]) for row in map_table.rows)
     assert ours == peers
     assert not ours.startswith("0/")
+
+
+def test_a_rival_that_fails_is_a_row_with_its_last_words(tmp_path: Path) -> None:
+    def words(python: Path, cloud: Path, out: Path) -> list[str]:
+        return [str(python), "-c", "raise ValueError('no stems')"]
+
+    failing = rivals.Program("failing", (), words, lambda _: (np.zeros((0, 2)), np.zeros(0)))
+    row = rivals._row(failing, Path(sys.executable), tmp_path / "cloud.laz", "pine_plot")
+    assert len(row) == len(rivals.COLUMNS) - 1
+    assert row[-1] == "ValueError: no stems"
+    missing = rivals._row(failing, "not installed: no such package", tmp_path / "cloud.laz", "pine_plot")
+    assert missing[0] == "failing"
+    assert missing[-1] == "not installed: no such package"
 
 
 def test_a_recording_gives_back_what_was_written(tmp_path: Path) -> None:

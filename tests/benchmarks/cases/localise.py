@@ -30,6 +30,11 @@ STANDS = {
 }
 FELLED = 0.1
 MAP_SEED = 1
+RECALL = "Wild_V03"  # the recording that TreeLoc++ reports
+RECALL_NOTE = (
+    "Frames within 5 m of the path of the map; found: the best pose is within 5 m. Needed: 0.95. TreeLoc++ "
+    "reports 0.951 for revisits within V03; here the map is that of another visit."
+)
 #: What the issue asks for: found [%], wrong fixes, position [m], heading [degrees], search [ms].
 NEEDED = (95.0, 0, 0.3, 1.0, 50.0)
 
@@ -75,7 +80,7 @@ def _simulated(starts: int) -> Table:
 def _recorded(root: Path, starts: int) -> list[Table]:
     """Each drive of Wild-Places in each map, and in the map of another forest."""
     from tests.benchmarks.localise.drives import recorded_drive
-    from tests.benchmarks.localise.starts import COLUMNS, LONGER, WITHIN, row_of, run_start
+    from tests.benchmarks.localise.starts import COLUMNS, LONGER, WITHIN, frames_found, row_of, run_start
 
     drives = [recorded_drive(file.stem, file) for file in sorted((root / "wild_places").glob("*.npz"))]
     maps = [_kept(drive.name, drive) for drive in drives]
@@ -101,6 +106,13 @@ def _recorded(root: Path, starts: int) -> list[Table]:
         (m.name, len(m.stored), size := len(m.stored.as_bytes()) / 1e3, 1e3 * size / float(d.driven[-1]))
         for m, d in zip(maps, drives, strict=True)
     ]
+    frames = list[tuple[Cell, ...]]()
+    for drive in drives:
+        if drive.name == RECALL:
+            for stored in maps:
+                if stored.name != drive.name:
+                    found, of = frames_found(drive, stored)
+                    frames.append((drive.name, stored.name, found, of, found / max(of, 1)))
     note = "Needed: 100 kB per kilometre. The files have no terrain, because these recordings have none."
     offset = (
         "The true poses of the drives share a frame only to 0.5 m, with errors that differ by 0.1 to 0.2 m "
@@ -109,6 +121,7 @@ def _recorded(root: Path, starts: int) -> list[Table]:
     )
     return [
         Table("Wild-Places", ("drive", "in", *COLUMNS), tuple(rows), (*_notes(everything), offset)),
+        Table("Single frames", ("frames", "in", "found", "of", "recall@1"), tuple(frames), (RECALL_NOTE,)),
         Table("Size of a stored map", ("map", "stems", "kB", "kB/km"), tuple(sizes), (note,)),
     ]
 

@@ -1,108 +1,31 @@
-"""Whole clouds of real plots, mapped at once and scanned virtually by a robot that drives through them."""
+"""The cloud of a real plot, scanned virtually by a robot that drives through it."""
 
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 
-from tests.benchmarks.cases.start import command
-from tests.benchmarks.process import environment
 from tests.benchmarks.seeds import chosen_seeds
-from tests.benchmarks.table import Table, verdict
-from tests.benchmarks.timing import middle
+from tests.benchmarks.table import Table
 
 NAME = "plot"
-LINE = "Real plots: the whole cloud mapped, and a VLP-16 driven through it (needs STEMMAP_DATA)"
+LINE = "A real plot with a VLP-16 driven through it (needs STEMMAP_DATA); whole clouds: rivals"
 SEEDS = range(3)
 SPREAD = 4.0  # cm; a diameter is scored where the tools that told it agree so far
 MATCH = 0.5  # m
-ASKED_S, ASKED_MB = 5.0, 400.0  # of `stemmap map pine_plot.laz`
-ROUNDS = 3  # whole processes that are timed, after one that is not
 
 
 def run() -> list[Table]:
-    """All three tables."""
+    """Drives with exact and with normal odometry."""
     from pipeline.errors import StemmapError
 
     folder = Path(os.environ.get("STEMMAP_DATA", "../shared/data")) / "forest"
     if not (folder / "pine_plot.laz").is_file():
         raise StemmapError("there is no real data", where=str(folder), remedy="Set STEMMAP_DATA")
-    return [_whole(folder), _processes(folder), _driven(folder)]
+    return [_driven(folder)]
 
 
-def _whole(folder: Path) -> Table:
-    import time
-
-    from app.extensions.clouds.inventory import map_plot
-    from pipeline.config import preset
-    from pipeline.io.readers.clouds import open_cloud
-
-    rows = []
-    for name in ("pine_plot", "MLS_Clip"):
-        file = str(folder / f"{name}.laz")
-        map_plot(open_cloud(file), preset("forest"))  # warm
-        began = time.process_time()
-        cloud = open_cloud(file)
-        plot = map_plot(cloud, preset("forest"))
-        seconds = time.process_time() - began
-        place = plot.trees.position + cloud.description.offset[:2]
-        scores = stem_scores(place, plot.trees.dbh, folder / f"{name}_stems.csv")
-        rows.append((name, plot.counts["read"], len(place), *scores, seconds))
-    columns = ("cloud", "points", "trees", *_SCORES, "CPU [s]")
-    return Table("The whole cloud", columns, tuple(rows))
-
-
-def _processes(folder: Path) -> Table:
-    """What `stemmap map` takes from its start to its end."""
-    rows: list[tuple[str, float, float, float]] = []
-    for name in ("pine_plot", "MLS_Clip"):
-        taken = [_process(folder / f"{name}.laz") for _ in range(ROUNDS + 1)][1:]
-        wall, cpu, peak = (middle([run[k] for run in taken]) for k in range(3))
-        rows.append((name, wall, cpu, peak))
-    _, wall, cpu, peak = rows[0]
-    reached = verdict(cpu <= ASKED_S), verdict(wall <= ASKED_S), verdict(peak <= ASKED_MB)
-    return Table(
-        "`stemmap map` as a whole process",
-        ("cloud", "wall [s]", "CPU [s]", "peak [MB]"),
-        tuple(rows),
-        (
-            f"Medians of {ROUNDS}. Asked for of pine_plot: at most {ASKED_S:g} s: by CPU time {reached[0]}, "
-            f"by the wall clock {reached[1]}; at most {ASKED_MB:g} MB: {reached[2]}.",
-        ),
-    )
-
-
-def _process(file: Path) -> tuple[float, float, float]:
-    """Wall clock and CPU time [s], and peak of the memory [MB]."""
-    with tempfile.TemporaryDirectory() as out:
-        words = command("map", str(file), "--out", out, "--force")
-        told = subprocess.run(
-            [sys.executable, "-I", "-S", "-c", _MEASURE, *words],
-            env=environment(),
-            stdout=subprocess.PIPE,
-            text=True,
-            check=True,
-        ).stdout.split()
-    wall, cpu, peak = map(float, told)
-    return wall, cpu, peak / 1e3
-
-
-#: Linux hands a peak on through fork and exec: a small process starts the one that is measured.
-_MEASURE = """
-import os, subprocess, sys, time
-began = time.perf_counter()
-child = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-_, status, used = os.wait4(child.pid, 0)
-wall = time.perf_counter() - began
-child.returncode = os.waitstatus_to_exitcode(status)
-print(wall, used.ru_utime + used.ru_stime, used.ru_maxrss)
-sys.exit(child.returncode not in (0, 3))
-"""
-
-_SCORES = (
+SCORES = (
     "found",
     "of",
     "position RMSE [cm]",
@@ -111,7 +34,7 @@ _SCORES = (
     "DBH scored",
     "their position [cm]",
 )
-_NO_SCORES = (None,) * len(_SCORES)
+_NO_SCORES = (None,) * len(SCORES)
 
 
 def stem_scores(place, dbh, table: Path) -> tuple[int | float | None, ...]:
@@ -183,5 +106,5 @@ def _driven(folder: Path) -> Table:
             place = frame.trees.position[kept]
             scores = _against(place, frame.trees.dbh[kept], truth, stems, match(place, truth, MATCH))
             rows.append((odometry, seed, len(place), *scores))
-    columns = ("odometry", "seed", "trees", *_SCORES)
+    columns = ("odometry", "seed", "trees", *SCORES)
     return Table("pine_plot.laz scanned virtually", columns, tuple(rows))

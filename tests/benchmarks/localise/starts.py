@@ -11,6 +11,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from pipeline.localisation import Localiser, State
+from pipeline.localisation.search import MapIndex, search_map
+from pipeline.loop_closure.stem_matching import MapStems
 from tests.benchmarks.localise.drives import Drive, Reference, frame_offsets
 
 WITHIN = 60.0  # m of driving
@@ -101,6 +103,35 @@ def run_start(
         if of:
             start.error_xy, start.error_yaw = (float(v) for v in np.median(of, axis=0))
     return starts
+
+
+REVISIT = 5.0  # m; TreeLoc++ counts a place within it as found
+SEEN = 30.0  # m around the robot, in which the stems of a single frame are
+SIGMA, SLACK = 0.05, 0.1  # m; of a stem, and the distortion of the map, as in `Localiser`
+LEVEL = 1e-6  # of false alarms; the best pose is counted without its test
+
+
+def frames_found(drive: Drive, reference: Reference) -> tuple[int, int]:
+    """Return how many single frames of a drive are found in a stored map, and the number of frames within
+    REVISIT of its drive.
+
+    A frame is levelled by its true roll and pitch, as by gravity. The best pose of a search counts as found
+    within REVISIT, whether or not the search accepts it (recall@1).
+    """
+    index = MapIndex.of(reference.stored, SLACK)
+    found = of = 0
+    for k, truth in enumerate(drive.truth):
+        there = reference.there(truth)
+        if there is None or not reference.covers(truth[None, :2], REVISIT):
+            continue
+        of += 1
+        here = drive.seen(k, SEEN) - truth[:2]
+        unknown = np.full(len(here), np.nan)
+        stems = MapStems(here, np.full(len(here), SIGMA), unknown, unknown)
+        fix = search_map(stems, index, SLACK, LEVEL)
+        if fix.pose is not None:
+            found += math.hypot(fix.pose.x - there.x, fix.pose.y - there.y) <= REVISIT
+    return found, of
 
 
 COLUMNS = (
