@@ -30,7 +30,8 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
     lists [x [m], y [m], yaw [rad]] of `T_map_base` and `T_odom_base`; `sigma_xy`, the root mean square of the
     standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; `health`, `trees`, `clusters`,
     `layers` and `clearance`, the results of the functions of this module; `loops`, pairs of scans,
-    `problems` and `repaired_numbers`, as in `Shown`; and the keys of `counts_of`.
+    `problems` and `repaired_numbers`, as in `Shown`; `intensity`, whether the returns have one;
+    and the keys of `counts_of`.
 
     Args:
         shown: The scan with the map.
@@ -53,6 +54,7 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         **counts_of(frame, truth, match_distance),
         "layers": layer_counts(frame),
         "clearance": clearance_payload(frame.clearance),
+        "intensity": frame.reflectance is not None,
         "loops": shown.loops.tolist(),
         "problems": list(shown.problems),
         "repaired_numbers": [list(numbers) for numbers in shown.repaired_numbers],

@@ -137,7 +137,7 @@ def of_lines(each: NDArray[np.uint8]) -> Colours:
     return np.round(255.0 * linear).astype(np.uint8)
 
 
-COLOUR_BY = ("verdict", "stage", "cluster", "height", "eccentricity")
+COLOUR_BY = ("verdict", "stage", "cluster", "height", "intensity", "eccentricity")
 LABEL_BY = ("eccentricity", "verdict", "DBH", "none")
 
 

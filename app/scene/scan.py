@@ -58,25 +58,33 @@ class ScanNodes:
             view: Visible layers, colours and labels.
             labelled: Positions of the labels of trees, see `cluster_labels`.
         """
-        layers, ends = view.layers, height_range(frame)
+        layers = view.layers
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
         numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
         raw, filtered = nodes.scan_in_map(frame, frame.raw), nodes.scan_in_map(frame, frame.filtered)
         size = None if frame.of_drive else point_size(frame)
-        self._raw.show(layers["raw"], raw, self._ramp_or(frame.raw, view, colours.RAW, ends))
         # The points of the trees without a drive are those of the clusters, and are not drawn twice.
         rest = slice(None) if frame.of_drive else frame.labels < 0
+        of_raw: Colours | colours.Rgb = colours.RAW
+        of_filtered: Colours | colours.Rgb = colours.FILTERED
+        of_clusters = cluster_colours(frame, numbers, view.colour_by)
+        if view.colour_by == "height":
+            of_raw, of_filtered = colours.ramp(frame.raw[:, 2], *height_range(frame)), of_clusters[rest]
+        elif view.colour_by == "intensity" and frame.reflectance is not None and len(frame.raw):
+            of_raw, of_clusters = by_intensity(frame.raw, frame.reflectance, frame.filtered)
+            of_filtered = of_clusters[rest]
+        self._raw.show(layers["raw"], raw, of_raw)
         self._filtered.show(
             layers["filtered"],
             filtered[rest],
-            self._ramp_or(frame.filtered[rest], view, colours.FILTERED, ends),
+            of_filtered,
             point_size=size or FILTERED_SIZE,
         )
         member = frame.labels >= 0
         self._clusters.show(
             layers["clusters"],
             filtered[member],
-            cluster_colours(frame, numbers, view.colour_by)[member],
+            of_clusters[member],
             point_size=size or CLUSTER_SIZE,
         )
         self._show_fits(frame, layers["fits"])
@@ -94,22 +102,6 @@ class ScanNodes:
                 (3,) each.
         """
         return meant(origin, direction, *self._axes, instance)
-
-    @staticmethod
-    def _ramp_or(
-        points: NDArray[np.float32], view: ViewSettings, plain: colours.Rgb, ends: tuple[float, float]
-    ) -> Colours | colours.Rgb:
-        """Return colours by height, one per point, if the view is coloured so; otherwise the plain colour.
-
-        Args:
-            points: Points in the level frame of the sensor, shape (N, 3) [m].
-            view: The choices.
-            plain: Colour of all points if the view is not coloured by height.
-            ends: Heights at the ends of the ramp [m].
-        """
-        if view.colour_by == "height":
-            return colours.ramp(points[:, 2], *ends)
-        return plain
 
     def _show_fits(self, frame: Frame, on: bool) -> None:
         """Show a cylinder for each detected stem with a fitted circle; none without a drive, where circles
@@ -183,6 +175,17 @@ def height_range(frame: Frame) -> tuple[float, float]:
         return HEIGHT_LOW, HEIGHT_HIGH
     low, high = np.percentile(frame.filtered[:, 2], (1.0, 99.0))
     return float(low), float(high)
+
+
+def by_intensity(
+    raw: NDArray[np.float32], reflectance: NDArray[np.float32], filtered: NDArray[np.float32]
+) -> tuple[Colours, Colours]:
+    """Return the colours of raw and filtered points by reflectance, uint8, shapes (N, 3) and (M, 3). The ends
+    of the ramp are the percentiles 1 and 99; a filtered point has the colour of the nearest raw point."""
+    from scipy.spatial import cKDTree
+
+    found = colours.ramp(reflectance, *np.percentile(reflectance, (1.0, 99.0)).tolist())
+    return found, found[cKDTree(raw).query(filtered)[1]]
 
 
 def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:

@@ -201,16 +201,21 @@ def picture_of(frame: Frame) -> Frame:
     return replace(
         frame,
         raw=frame.raw[raw],
+        reflectance=None if frame.reflectance is None else frame.reflectance[raw],
         filtered=frame.filtered[filtered],
         labels=frame.labels[filtered],
         counts={**frame.counts, NOT_DRAWN: left_out},
     )
 
 
+def _without_raw(frame: Frame) -> Frame:
+    return replace(frame, raw=np.zeros((0, 3), np.float32), reflectance=None)
+
+
 def for_comparison(frame: Frame) -> Frame:
     """Return the frame for the comparison of parameter sets: as `picture_of`, without raw points, voxel
     columns and ground, which do not depend on the parameters or are not rendered."""
-    return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))
+    return picture_of(_without_raw(replace(frame, columns=None, ground=None)))
 
 
 _MOST_SCANS = 60  # at twenty scans per second a click may be three seconds old
@@ -231,7 +236,7 @@ class RecentScans:
             run: Number of the run.
             frame: Results of the scan.
         """
-        small = replace(frame, raw=np.zeros((0, 3), np.float32))
+        small = _without_raw(frame)
         with self._lock:
             self._frames[run, frame.index] = small
             self._frames.move_to_end((run, frame.index))

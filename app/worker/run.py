@@ -32,12 +32,14 @@ from app.worker.unmapped import unmapped_frame
 from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
 from pipeline.config.model import validated
+from pipeline.config.stages import Acquisition
 from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.front_end import SegmentedScan, StageTimer
 from pipeline.geometry.columns import GrowingColumns, evenly_spaced
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
+from pipeline.preprocessing import acquired_reflectance
 from pipeline.remapping.preview import KnownMap, needs_sample, preview_trees, sample_scans
 from pipeline.remapping.rerun import Rerun, ScanCaches
 from pipeline.slam.keyframe_graph import KeyframeGraph
@@ -271,7 +273,8 @@ class Run:
         self._broken = False
         if new_map:
             self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))
-        self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
+        trees, acquisition = self._numbers.renumber(frame.trees), mapper.parameters.acquisition
+        self.frame = replace(frame, trees=trees, reflectance=_reflectance(frame.raw, step, acquisition))
         self._step, self.current = step, step.index
         self.graph, self.tree_landmarks = mapper.graph, mapper.tree_landmarks
         self._map.add(frame, free, spent)
@@ -293,7 +296,9 @@ class Run:
         with self.stopwatch.aside():
             scan = mapper.segment(step)
         trees, rows = self._numbers.stored(shown.frame.trees)
-        frame = replace(shown.frame, raw=scan.raw, filtered=scan.filtered, labels=scan.labels, trees=trees)
+        reflectance = _reflectance(scan.raw, step, wanted.acquisition)
+        frame = replace(shown.frame, raw=scan.raw, filtered=scan.filtered, labels=scan.labels)
+        frame = replace(frame, trees=trees, reflectance=reflectance)
         confirmed_s = None if shown.confirmed_s is None else shown.confirmed_s[rows]
         return msgspec.structs.replace(shown, frame=frame, confirmed_s=confirmed_s)
 
@@ -561,3 +566,9 @@ def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Para
     except ParameterError:
         return ()
     return tuple(sets)
+
+
+def _reflectance(raw: Float32, step: Step, parameters: Acquisition) -> Float32 | None:
+    """Return the reflectance of the raw points; None for a segmented scan that is stored without points."""
+    reflectance = acquired_reflectance(step, parameters) if len(raw) else None
+    return reflectance if reflectance is not None and len(reflectance) == len(raw) else None

@@ -54,6 +54,8 @@ def test_the_whole_map_is_shown_and_home_returns_to_the_first_view(dashboard: Da
     dashboard.eventually(lambda: scene.evaluate(CAMERA) == first, lambda: scene.evaluate(CAMERA))
     dashboard.page.evaluate(CHOOSE, ["colour_by", "eccentricity"])
     expect(page.locator("#colour-bar")).to_contain_text("Eccentricity e of a cluster")
+    dashboard.page.evaluate(CHOOSE, ["colour_by", "intensity"])
+    expect(page.locator("#colour-bar")).to_contain_text("Intensity of the returns")
     dashboard.page.evaluate(CHOOSE, ["colour_by", "verdict"])
     expect(page.locator("#colour-bar")).to_be_hidden()
 

@@ -14,6 +14,7 @@ const TITLES = { colour_by: "Colour by", label_by: "Labels", accumulated: "Accum
 // What the colours of the scene mean where they are a ramp: title and ticks.
 const BARS = {
   height: (drive) => (drive ? ["height of the scan relative to the sensor", ["−1 m", "+1 m", "+3 m"]] : ["height", ["low", "high"]]),
+  intensity: () => (state.map?.intensity === false ? ["this source has no intensity", []] : ["intensity of the returns", ["weak", "strong"]]),
   eccentricity: () => ["eccentricity e of a cluster", ["1 round", "10", "100 a line"]],
 };
 const counts = {};
@@ -57,6 +58,8 @@ function showBar({ colour_by: { value }, ramp }) {
   bar.hidden = !words;
   if (!words) return;
   const [title, ticks] = words(isDrive());
+  if (bar.dataset.shown === title) return;
+  bar.dataset.shown = title;
   setText(bar.querySelector("figcaption"), capital(title));
   bar.querySelector("i").style.background = `linear-gradient(90deg, ${ramp.join(", ")})`;
   bar.querySelector("ol").replaceChildren(...ticks.map((text) => el("li", { text })));
@@ -74,6 +77,6 @@ export function startLayers() {
   byId("look-behind").addEventListener("click", () => pressInScene("b"));
   byId("follow").addEventListener("click", toggleFollow);
   on("view", () => { Object.assign(newest, state.view?.counts); show(); });
-  on("map", () => Object.assign(newest, state.map?.layers));
+  on("map", () => { Object.assign(newest, state.map?.layers); if (state.view) showBar(state.view); });
   on("map truth", throttled(count, EVERY));
 }

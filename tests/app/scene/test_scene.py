@@ -114,8 +114,20 @@ def test_trees_that_are_not_confirmed_are_not_shown(scene: Scene):
     assert len(node(scene, "/world/trees").batched_positions) == 3
 
 
+def test_points_are_coloured_by_intensity_where_the_source_has_it(scene: Scene):
+    frame = make_frame(2, clusters=5)
+    bright = np.linspace(0.0, 90.0, len(frame.raw), dtype=np.float32)
+    scene.choose("colour_by", "intensity")
+    scene.show(dataclasses.replace(frame, reflectance=bright), PATH[:3])
+    found = node(scene, "/world/robot/scan/raw").colors.astype(int)
+    assert found[0, 2] > found[-1, 2]  # from violet
+    assert found[0, 0] < found[-1, 0]  # to yellow
+    scene.show(frame, PATH[:3])
+    assert len(np.unique(node(scene, "/world/robot/scan/raw").colors, axis=0)) == 1
+
+
 def test_colours_are_as_many_as_points(scene: Scene):
-    for name in ("verdict", "stage", "cluster", "height", "eccentricity"):
+    for name in ("verdict", "stage", "cluster", "height", "intensity", "eccentricity"):
         scene.choose("colour_by", name)
         scene.show(make_frame(2, clusters=5), PATH[:3])
         for cloud in ("raw", "filtered", "clusters"):
