@@ -51,16 +51,6 @@ def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[F
     return points, sensor_offset
 
 
-def acquired_reflectance(step: Step, parameters: Acquisition) -> Float32 | None:
-    """Return the reflectance of the points of `acquire`, float32, shape (N,), in the scale of the sensor;
-    None if the scan has none."""
-    if step.scan.reflectance is None:
-        return None
-    beyond = float(np.nextafter(parameters.range_max, np.inf))
-    rows = _rows_in_range(step.scan.points, parameters.range_min, beyond)
-    return np.asarray(step.scan.reflectance[rows], np.float32)
-
-
 def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Float32:
     """Return the points from HOUSING to below `range_min` from the sensor, in the level sensor frame,
     float32, shape (N, 3) [m], in their order.

@@ -103,7 +103,7 @@ class Dashboard:
         self.exporting = asyncio.Lock()  # during an export, so that exports never take all places of `ask`
         self.layers: dict[str, tuple[str, bytes]] = {}  # digest and bytes of the newest ones
         self._go = False
-        self._show_scene = Throttle(lambda frame, path: self.scene.show(frame, path), pause_s=_SCENE_PAUSE_S)
+        self._show_scene = Throttle(lambda *shown: self.scene.show(*shown), pause_s=_SCENE_PAUSE_S)
 
     @property
     def truth(self) -> TruthTrees | None:
@@ -492,7 +492,7 @@ class Dashboard:
             self._broadcast_events()
         self.run_recorder.shown(ShownRun.of(self), self.scores.latest)
         self._score()
-        self._show_scene(shown.frame, path_rows)
+        self._show_scene(shown.frame, path_rows, shown.reflectance)
         await self.loop.shown(shown.time_s, self.status)
 
     def _broadcast_score(self, score: dict[str, Any] | None) -> None:

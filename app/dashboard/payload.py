@@ -54,7 +54,7 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         **counts_of(frame, truth, match_distance),
         "layers": layer_counts(frame),
         "clearance": clearance_payload(frame.clearance),
-        "intensity": frame.reflectance is not None,
+        "intensity": shown.reflectance is not None,
         "loops": shown.loops.tolist(),
         "problems": list(shown.problems),
         "repaired_numbers": [list(numbers) for numbers in shown.repaired_numbers],

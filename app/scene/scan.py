@@ -49,7 +49,13 @@ class ScanNodes:
         for batch in (self._markers, self._fits):
             _report(batch, self._markers, on_cluster)
 
-    def show(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
+    def show(
+        self,
+        frame: Frame,
+        view: ViewSettings,
+        labelled: Sequence[Place],
+        reflectance: NDArray[np.float32] | None = None,
+    ) -> None:
         """Show a scan. Without a drive, points of clusters are not shown as filtered points, and clusters
         have neither labels nor fitted circles.
 
@@ -57,6 +63,7 @@ class ScanNodes:
             frame: Results of the scan.
             view: Visible layers, colours and labels.
             labelled: Positions of the labels of trees, see `cluster_labels`.
+            reflectance: Of the raw points, shape (N,), in the scale of the sensor; None if unknown.
         """
         layers = view.layers
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
@@ -70,8 +77,8 @@ class ScanNodes:
         of_clusters = cluster_colours(frame, numbers, view.colour_by)
         if view.colour_by == "height":
             of_raw, of_filtered = colours.ramp(frame.raw[:, 2], *height_range(frame)), of_clusters[rest]
-        elif view.colour_by == "intensity" and frame.reflectance is not None and len(frame.raw):
-            of_raw, of_clusters = by_intensity(frame.raw, frame.reflectance, frame.filtered)
+        elif view.colour_by == "intensity" and reflectance is not None and len(reflectance):
+            of_raw, of_clusters = by_intensity(frame.raw, reflectance, frame.filtered)
             of_filtered = of_clusters[rest]
         self._raw.show(layers["raw"], raw, of_raw)
         self._filtered.show(

@@ -51,6 +51,7 @@ class Scene:
         self._tuning = PanelCommands(commands, self._put_back)
         self._parameters, self._preset = preset("forest"), "forest"
         self._frame: Frame | None = None
+        self._reflectance: NDArray[np.float32] | None = None
         self._path: Float = np.zeros((0, 4))
         self._truth: TruthTrees | None = None
         self._selected: int | None = None
@@ -68,7 +69,7 @@ class Scene:
         """Number of messages that viser has numbered since it was started."""
         return messages_sent(self._server)
 
-    def show(self, frame: Frame, path: Float) -> None:
+    def show(self, frame: Frame, path: Float, reflectance: NDArray[np.float32] | None = None) -> None:
         """Show the results of a scan. The first one sets the distance of the cameras to the extent of a whole
         cloud. After RENEW_AFTER messages viser is restarted first, and `port` changes.
 
@@ -76,9 +77,10 @@ class Scene:
             frame: Results of the scan.
             path: Positions of the robot at all scans: x, y in the frame of the map and x, y by odometry, NaN
                 where unknown, shape (N, 4) [m].
+            reflectance: Of the raw points, shape (M,), in the scale of the sensor; None if unknown.
         """
         first = self._frame is None
-        self._frame, self._path = frame, path
+        self._frame, self._path, self._reflectance = frame, path, reflectance
         if first:
             self._follower.frame_plot(0.0 if frame.of_drive else extent(frame))
         self._accumulated.take(frame)
@@ -159,7 +161,7 @@ class Scene:
     def clear(self) -> None:
         """Remove run, ground truth and selection from the scene. The panel and the choices of the view
         stay; the cameras return to the size of a robot."""
-        self._frame, self._path = None, np.zeros((0, 4))
+        self._frame, self._path, self._reflectance = None, np.zeros((0, 4)), None
         self._truth = self._selected = self._ring = None
         self._accumulated, self._feet = Accumulated(), TreeFeet()
         self._follower.frame_plot(0.0)  # the new one does not know where the cameras are
@@ -248,7 +250,7 @@ class Scene:
             self._map.show(frame, self._selected, self._ring, self._view, self._feet)
             self._map.show_truth(self._truth, self._view)
             self._robot.show(frame, self._path, self._view, self._map.ground)
-            self._scan.show(frame, self._view, self._map.labelled)
+            self._scan.show(frame, self._view, self._map.labelled, self._reflectance)
             self._gathered.show(layers["gathered"], self._accumulated.points_of(self._view.accumulated))
             self._voxels.show(layers["voxels"], frame, parameters.filters.voxel_size)
             self._way.show_ahead(layers["way"], frame, parameters.obstacles)

@@ -427,6 +427,7 @@ class WorkerLoop:
                     session.shown.loops,
                     () if repaired is None else session.shown.repairs,
                     () if repaired is None else repaired.numbers,
+                    session.shown.reflectance,
                 )
             )
 

@@ -41,6 +41,7 @@ class OneStepRun:
     is_whole = True
     start_ns = 0
     path: Path = NO_PATH
+    reflectance = None
     odometry_xy: Float = np.zeros((0, 2))
     cache_notice = ""
 

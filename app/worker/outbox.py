@@ -152,7 +152,9 @@ class Outbox:
         from now on."""
         old, self._sent_path = self._sent_path, shown.path
         start = 0 if old is None or shown.run != self._sent_run else rows_in_common(old, shown.path)
-        picture = picture_of(shown.frame)
+        picture, reflectance = picture_of(shown.frame), shown.reflectance
+        if reflectance is not None:
+            reflectance = reflectance[evenly_spaced(len(reflectance), MOST_POINTS)]
         if picture.ground is self._sent_ground and shown.run == self._sent_run:
             picture = replace(picture, ground=None)
         else:
@@ -164,6 +166,7 @@ class Outbox:
             path_start=start,
             path=rows_of(shown.path, slice(start, None)),
             odometry_xy=shown.odometry_xy[start:],
+            reflectance=reflectance,
         )
 
 
@@ -201,21 +204,16 @@ def picture_of(frame: Frame) -> Frame:
     return replace(
         frame,
         raw=frame.raw[raw],
-        reflectance=None if frame.reflectance is None else frame.reflectance[raw],
         filtered=frame.filtered[filtered],
         labels=frame.labels[filtered],
         counts={**frame.counts, NOT_DRAWN: left_out},
     )
 
 
-def _without_raw(frame: Frame) -> Frame:
-    return replace(frame, raw=np.zeros((0, 3), np.float32), reflectance=None)
-
-
 def for_comparison(frame: Frame) -> Frame:
     """Return the frame for the comparison of parameter sets: as `picture_of`, without raw points, voxel
     columns and ground, which do not depend on the parameters or are not rendered."""
-    return picture_of(_without_raw(replace(frame, columns=None, ground=None)))
+    return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))
 
 
 _MOST_SCANS = 60  # at twenty scans per second a click may be three seconds old
@@ -236,7 +234,7 @@ class RecentScans:
             run: Number of the run.
             frame: Results of the scan.
         """
-        small = _without_raw(frame)
+        small = replace(frame, raw=np.zeros((0, 3), np.float32))
         with self._lock:
             self._frames[run, frame.index] = small
             self._frames.move_to_end((run, frame.index))

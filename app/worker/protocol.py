@@ -21,7 +21,7 @@ from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 from pipeline.repairs.record import Repair
 from pipeline.types.camera import Camera, Picture
-from pipeline.types.records import Float, Frame, Int, Path, Trees, TruthTrees
+from pipeline.types.records import Float, Float32, Frame, Int, Path, Trees, TruthTrees
 
 # Beyond any run, and well inside of an int64 of nanoseconds.
 LONGEST_S = 1e9
@@ -251,6 +251,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
         repairs: The repairs to which `problems` belongs.
         repaired_numbers: Numbers of the trees that each of them is about, see `RepairedMap`.
+        reflectance: Of the raw points, float32, shape (N,), in the scale of the sensor; None if unknown.
     """
 
     run: int
@@ -265,6 +266,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     loops: Int = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
     repairs: tuple[Repair, ...] = ()
     repaired_numbers: tuple[tuple[int, ...], ...] = ()
+    reflectance: Float32 | None = None
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):

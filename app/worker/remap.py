@@ -138,7 +138,6 @@ class FrameStore:
         lean = replace(
             frame,
             raw=no_points,
-            reflectance=None,
             filtered=no_points,
             labels=frame.labels[:0],
             columns=frame.columns if columns_in == frame.index else None,

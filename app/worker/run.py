@@ -39,7 +39,6 @@ from pipeline.geometry.columns import GrowingColumns, evenly_spaced
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.preprocessing import acquired_reflectance
 from pipeline.remapping.preview import KnownMap, needs_sample, preview_trees, sample_scans
 from pipeline.remapping.rerun import Rerun, ScanCaches
 from pipeline.slam.keyframe_graph import KeyframeGraph
@@ -131,6 +130,13 @@ class Run:
         """Return the counts of the map up to a scan that was mapped. Only `losses` is not limited to that
         scan: it has all that was left out so far while the source was read."""
         return self._map.counts.totals(index, self.warnings, self.losses)
+
+    @property
+    def reflectance(self) -> Float32 | None:
+        """Reflectance of the raw points of the current scan, see `reflectance_of`."""
+        if self.frame is None or self._step is None:
+            return None
+        return reflectance_of(self.frame.raw, self._step, self._map.mapper.parameters.acquisition)
 
     @property
     def losses(self) -> dict[str, int]:
@@ -273,8 +279,7 @@ class Run:
         self._broken = False
         if new_map:
             self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))
-        trees, acquisition = self._numbers.renumber(frame.trees), mapper.parameters.acquisition
-        self.frame = replace(frame, trees=trees, reflectance=_reflectance(frame.raw, step, acquisition))
+        self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
         self._step, self.current = step, step.index
         self.graph, self.tree_landmarks = mapper.graph, mapper.tree_landmarks
         self._map.add(frame, free, spent)
@@ -296,11 +301,10 @@ class Run:
         with self.stopwatch.aside():
             scan = mapper.segment(step)
         trees, rows = self._numbers.stored(shown.frame.trees)
-        reflectance = _reflectance(scan.raw, step, wanted.acquisition)
-        frame = replace(shown.frame, raw=scan.raw, filtered=scan.filtered, labels=scan.labels)
-        frame = replace(frame, trees=trees, reflectance=reflectance)
+        frame = replace(shown.frame, raw=scan.raw, filtered=scan.filtered, labels=scan.labels, trees=trees)
         confirmed_s = None if shown.confirmed_s is None else shown.confirmed_s[rows]
-        return msgspec.structs.replace(shown, frame=frame, confirmed_s=confirmed_s)
+        reflectance = reflectance_of(frame.raw, step, wanted.acquisition)
+        return msgspec.structs.replace(shown, frame=frame, confirmed_s=confirmed_s, reflectance=reflectance)
 
     def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> tuple[Frame, Float]:
         """Return the result of a step and the free range of its scan, and cache the segmented scan.
@@ -568,7 +572,13 @@ def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Para
     return tuple(sets)
 
 
-def _reflectance(raw: Float32, step: Step, parameters: Acquisition) -> Float32 | None:
-    """Return the reflectance of the raw points; None for a segmented scan that is stored without points."""
-    reflectance = acquired_reflectance(step, parameters) if len(raw) else None
-    return reflectance if reflectance is not None and len(reflectance) == len(raw) else None
+def reflectance_of(raw: Float32, step: Step, parameters: Acquisition) -> Float32 | None:
+    """Return the reflectance of the raw points of a frame, float32, shape (N,), in the scale of the sensor;
+    None if the scan has none, and for a frame without points."""
+    if step.scan.reflectance is None or not len(raw):
+        return None
+    points = step.scan.points.astype(np.float64)
+    square = points[:, 0] ** 2 + points[:, 1] ** 2 + points[:, 2] ** 2
+    near = (square >= parameters.range_min**2) & (square <= parameters.range_max**2)  # as in `acquire`
+    found = np.asarray(step.scan.reflectance[near], np.float32)
+    return found if len(found) == len(raw) else None

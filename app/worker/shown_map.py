@@ -83,6 +83,12 @@ class ShownMap:
         return found
 
     @property
+    def reflectance(self) -> Float32 | None:
+        """Reflectance of the raw points of `frame`, float32, shape (N,); None where it is unknown."""
+        shown = self._kept or self.run
+        return None if shown is None else shown.reflectance
+
+    @property
     def is_hurried(self) -> bool:
         """Whether loops are repaired by an earlier solution."""
         return self._is_on_way() and any(repair.is_of_loop for repair in self.repairs)

@@ -25,7 +25,6 @@ def unmapped_frame(step: Step, T_base_lidar: Pose3, scan: SegmentedScan | None =
         index=step.index,
         stamp_ns=step.scan.stamp_ns,
         raw=raw,
-        reflectance=step.scan.reflectance if scan is None else None,
         filtered=np.zeros((0, 3), np.float32) if scan is None else scan.filtered,
         labels=np.zeros(0, np.int32) if scan is None else scan.labels,
         clusters=_no_clusters() if scan is None else scan.clusters,

@@ -703,8 +703,6 @@ class Frame:
         ground: Terrain map, updated every few scans; None without ground segmentation, or if it is unchanged.
         base_z: Height of the base in the terrain map [m].
         clearance: Free distance on the path of the robot; None without obstacle detection.
-        reflectance: float32, shape (N,), in the scale of the sensor: of the points of `raw`; None where it is
-            unknown, and where nobody looks at the scan.
         of_drive: Whether it is of the drive of a robot; else it is the map of a source as a whole, there is
             no robot, and the pose is the middle of the map.
     """
@@ -726,7 +724,6 @@ class Frame:
     ground: HeightMap | None = None
     base_z: float = 0.0
     clearance: Clearance | None = None
-    reflectance: Float32 | None = None
     of_drive: bool = True
 
     @property

@@ -21,7 +21,8 @@ class FakeScene(Scene):
         self.secret = "secret"
         self.calls: list[tuple[str, Any]] = []
 
-    def show(self, frame: Frame, path: Any) -> None:
+    def show(self, frame: Frame, path: Any, reflectance: Any = None) -> None:
+        del reflectance
         assert path.shape[1] == 4
         self.calls.append(("show", frame.index))
 

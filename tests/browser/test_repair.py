@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.browser.conftest import opened
-from tests.browser.dashboard import Dashboard
+from tests.browser.dashboard import PRESET, Dashboard
 from tests.browser.serving import Server
 from tests.browser.test_annotate import place_of
 
@@ -46,6 +46,16 @@ def apart(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
         return min(math.hypot(tree["x"] - other["x"], tree["y"] - other["y"]) for other in others)
 
     return sorted(found, key=room, reverse=True)
+
+
+def near(found: list[dict[str, Any]], tree: dict[str, Any], beside: float = 0.0) -> bool:
+    """Whether a tree stands at the place of another one, or so far beside it in x."""
+    return any(math.hypot(each["x"] - tree["x"] - beside, each["y"] - tree["y"]) < 0.4 for each in found)
+
+
+FEWER_PARTICLES = """() => fetch('/api/parameters', { method: 'PATCH',
+  body: JSON.stringify({ changes: { 'slam.particles': 60 } }),
+  headers: { 'Content-Type': 'application/json' } })"""
 
 
 def use(dashboard: Dashboard, name: str) -> None:
@@ -123,6 +133,19 @@ def test_each_repair_changes_the_map_and_is_undone_and_redone(person: Dashboard)
         page.locator("#repair-redo").click()
     expect(listed).to_have_count(5)
     person.until_server("/api/trees", f"it.trees.length === {len(mended)}")
+
+    # They apply again after the run was mapped again with another value.
+    revision = person.ask("/api/parameters")["revision"]
+    page.evaluate(FEWER_PARTICLES)
+    person.until_server("/api/parameters", f"it.revision > {revision}")
+    revision = person.ask("/api/parameters")["revision"]
+    person.until_server("/api/status", f"it.revision === {revision} && it.remapped === null")
+    expect(page.locator("#repair-count")).to_have_text("5 repairs")
+    person.eventually(
+        lambda: all(not near(trees(person), at) for at in (b, e, f)) and near(trees(person), d, 1.0),
+        lambda: trees(person),
+    )
+    page.evaluate(PRESET, "forest")
 
     page.locator("#repairs li button").first.click()  # the newest: the deletion
     person.until_server("/api/trees", f"it.trees.some(tree => tree.number === {f['number']})")

@@ -118,7 +118,7 @@ def test_points_are_coloured_by_intensity_where_the_source_has_it(scene: Scene):
     frame = make_frame(2, clusters=5)
     bright = np.linspace(0.0, 90.0, len(frame.raw), dtype=np.float32)
     scene.choose("colour_by", "intensity")
-    scene.show(dataclasses.replace(frame, reflectance=bright), PATH[:3])
+    scene.show(frame, PATH[:3], bright)
     found = node(scene, "/world/robot/scan/raw").colors.astype(int)
     assert found[0, 2] > found[-1, 2]  # from violet
     assert found[0, 0] < found[-1, 0]  # to yellow

@@ -14,12 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.worker.protocol import Open, Status
+from app.worker.run import reflectance_of
 from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
+from pipeline.geometry.poses import Pose3
+from pipeline.preprocessing import acquire
 from pipeline.repairs.record import Repair
 from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer
-from pipeline.types.records import Frame, Step
+from pipeline.types.records import Frame, Scan, Step
 from tests.app.fakes import FakeMapper, FakeSource, make_session, scan
 
 SCANS = 130  # more than two kept states
@@ -496,6 +499,21 @@ def test_status_tells_the_figures_of_the_run() -> None:
     assert status.health == "no trees yet"
     assert "chain" in status.stage_ms
     assert session.next_ns() == scan(3).stamp_ns
+
+
+def test_reflectances_are_those_of_the_acquired_points() -> None:
+    acquisition = Parameters().acquisition
+    points = np.random.default_rng(3).uniform(-40.0, 40.0, (500, 3)).astype(np.float32)
+    points[:2] = [[acquisition.range_min, 0.0, 0.0], [acquisition.range_max, 0.0, 0.0]]  # both are within
+    bright = np.arange(500, dtype=np.float32)
+    step = Step(0, Scan(1, points, bright), None)
+    raw, _ = acquire(step, Pose3.identity(), acquisition)
+    found = reflectance_of(raw, step, acquisition)
+    assert found is not None
+    assert 2 < len(found) < 500
+    np.testing.assert_array_equal(points[found.astype(int)], raw)
+    assert reflectance_of(raw[:0], step, acquisition) is None
+    assert reflectance_of(raw, Step(0, Scan(1, points), None), acquisition) is None
 
 
 def test_status_counts_the_scans_that_are_left_out() -> None:

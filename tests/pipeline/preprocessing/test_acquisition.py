@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose3
-from pipeline.preprocessing import HOUSING, acquire, acquire_near, acquired_reflectance
+from pipeline.preprocessing import HOUSING, acquire, acquire_near
 from pipeline.types.records import Step
 from tests.pipeline.strategies import scan
 
@@ -52,20 +50,6 @@ def test_without_a_tilt_or_with_levelling_off_points_are_not_rotated():
     )
     np.testing.assert_allclose(unknown + MOUNTING.t, world, atol=1e-5)
     np.testing.assert_array_equal(unknown, unwanted)
-
-
-def test_reflectances_are_those_of_the_acquired_points():
-    rng = np.random.default_rng(3)
-    points = rng.uniform(-40.0, 40.0, (500, 3)).astype(np.float32)
-    points[:2] = [[FOREST.range_min, 0.0, 0.0], [FOREST.range_max, 0.0, 0.0]]  # both limits are within
-    bright = np.arange(500, dtype=np.float32)
-    step = Step(0, replace(scan(1, points), reflectance=bright), None)
-    kept, _ = acquire(step, Pose3.identity(), FOREST)
-    found = acquired_reflectance(step, FOREST)
-    assert found is not None
-    assert 2 < len(found) < 500
-    np.testing.assert_array_equal(points[found.astype(int)], kept)
-    assert acquired_reflectance(Step(0, scan(1, points), None), FOREST) is None
 
 
 @given(st.integers(0, 999), st.floats(-3.0, 3.0), st.floats(-0.5, 0.5))
