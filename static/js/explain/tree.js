@@ -49,7 +49,7 @@ function missingDbh({ coverage_deg, dbh_arc_deg }) {
 function covered(story) {
   const size = 200, middle = size / 2, radius = 66;
   const step = TURN / Math.max(story.sides.length, 1);
-  const seen = story.sides.flatMap((is, k) => (is ? [arc(middle, middle, radius, k * step, (k + 1) * step, "side")] : []));
+  const seen = story.sides.flatMap((is, k) => (is ? [arc(middle, middle, radius, k * step, (k + 1) * step, "sector")] : []));
   return picture(size, size, `Covered ${figure(story.coverage_deg)} degrees of the trunk`, circle(middle, middle, radius, "circle"), ...seen,
     text(middle, middle + 2, story.dbh === null ? "no DBH yet" : `${figure(100 * story.dbh)} cm`, story.dbh === null ? "" : "big", "middle"),
     text(middle, middle + 20, `${figure(story.coverage_deg)}° covered`, "small", "middle"),
