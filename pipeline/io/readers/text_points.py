@@ -100,6 +100,11 @@ def open_text(path: Path) -> PointTable:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(HEAD)
+        if _is_ptx(head):
+            raise ScanFileError(
+                "it is a PTX file, whose stations have own frames and poses, which are not read",
+                "Export it in one frame, as .e57, .laz or .pts",
+            )
         layout = find_layout(head)
         file.seek(layout.start)
         lines = ends = 0
@@ -146,6 +151,13 @@ def open_text(path: Path) -> PointTable:
         units=(layout.unit, layout.unit),
         exact=layout.count is not None,
     )
+
+
+def _is_ptx(head: bytes) -> bool:
+    """Return whether a text begins with the header of a PTX station: columns and rows of the scan, four lines
+    of three numbers (position and axes), four lines of four numbers (transform)."""
+    widths = [len(line.split()) for line in head.splitlines()[:10]]
+    return widths == [1, 1, 3, 3, 3, 3, 4, 4, 4, 4]
 
 
 def find_layout(head: bytes) -> _Layout:

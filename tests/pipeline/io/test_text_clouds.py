@@ -169,6 +169,16 @@ def test_a_folder_lists_texts_of_points_and_no_other_texts(tmp_path: Path):
     assert recordings_in(tmp_path) == ["plot.csv", "plot.pts"]
 
 
+@pytest.mark.parametrize("name", ["plot.ptx", "plot.txt"])
+def test_a_ptx_file_is_refused_as_its_stations_would_lie_on_one_another(tmp_path: Path, name: str):
+    station = "10\n100\n5 6 1.6\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n5 6 1.6 1\n"
+    path = tmp_path / name
+    path.write_text(2 * (station + 1000 * "1.5 2.5 0.5 0.7\n"))
+    with pytest.raises(SourceError, match="PTX") as caught:
+        open_cloud(str(path))
+    assert ".e57" in caught.value.remedy
+
+
 def test_utf_16_says_what_to_do(tmp_path: Path):
     (tmp_path / "c.xyz").write_text(lines(POINTS, "{x} {y} {z}"), encoding="utf-16")
     with pytest.raises(SourceError, match=r"UTF-16.*UTF-8"):
