@@ -134,6 +134,29 @@ def test_the_minimum_and_its_covariance_are_those_of_gtsam():
     np.testing.assert_allclose(solution.covariance[last], C @ Sigma @ C.T, rtol=0.25, atol=1e-5)
 
 
+def test_a_long_chain_is_solved_to_its_end():
+    # It bends with a tiny share of its stiffness, which no damping may hold.
+    true = np.column_stack([np.arange(400.0), np.zeros(400), np.zeros(400)])
+    row, side = np.divmod(np.arange(800), 2)
+    stems = np.column_stack([row - 0.5, np.where(side, 6.0, -6.0)])
+    graph = KeyframeGraph()
+    rng = np.random.default_rng(1)
+    bend = 1e-3 * np.arange(400)
+    bent = np.column_stack([np.cumsum(np.cos(bend)), np.cumsum(np.sin(bend)), bend])
+    for k, T in enumerate(true):
+        seen = np.flatnonzero(np.abs(stems[:, 0] - k) < 4.0)
+        centre = stems[seen] - T[:2] + SIGMA * rng.normal(size=(len(seen), 2))
+        R = np.tile([SIGMA**2, 0.0, SIGMA**2], (len(seen), 1))
+        motion = np.array([float(k > 0), 0.0, 1e-3])
+        graph = graph.with_keyframe(Keyframe(k, 0, float(k), motion, 9.0 * Q, seen, centre, R), bent[k])
+    first = graph.solve()
+    assert first is not None
+    again = replace(graph, pose=first.pose).solve()
+    assert again is not None
+    sigma = np.sqrt(first.covariance[-1, 2, 2])
+    assert abs(wrap_angle(again.pose[-1, 2] - first.pose[-1, 2])) < 0.1 * sigma
+
+
 def test_a_wrong_association_is_switched_off():
     true = arc(12)
     graph = graph_of(true, np.random.default_rng(1))
