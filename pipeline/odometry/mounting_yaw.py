@@ -36,6 +36,13 @@ _GROUND, _CELL = 0.4, 2.0
 _POINTS = 100
 #: Distance from the points of a map within which a point is one of it [m].
 _ON = 0.3
+#: The motion of a LiDAR that sees little of each side errs by up to this in its direction [rad].
+_YAW_ERROR = math.radians(12.0)
+#: A yaw is better if this share of the points more lie on others.
+_BETTER = 0.05
+#: Largest turn of the robot for which the place of a LiDAR, up to 1 m from the base, may be left out [rad]:
+#: it moves the points by less than _ON.
+_STRAIGHT = 0.3
 _REACH = (0.5, 40.0)  # m
 
 
@@ -165,9 +172,12 @@ def yaw_of_mounting(lidar: Float, odometry: Float) -> MountingYaw | None:
 
 
 def better_yaw(yaw: float, odometry: Float, points: Sequence[Float]) -> float:
-    """Return the yaw or its nearest right angle [rad], whichever lets the scans overlap more along the
-    odometry; the right angle if both are alike. The registration of a tilted LiDAR, which sees little
-    of each side, may miss a quarter of the motion, and its direction by ten degrees.
+    """Return the nearest right angle [rad] instead of the yaw, if the scans overlap more along the odometry
+    by it. The registration of a tilted LiDAR, which sees little of each side, may miss a quarter of the
+    motion, and its direction by ten degrees.
+
+    The yaw stays if it is more than _YAW_ERROR from a right angle, or the robot turned by more than
+    _STRAIGHT.
 
     Args:
         yaw: Yaw of the LiDAR by its registered motion [rad].
@@ -175,8 +185,10 @@ def better_yaw(yaw: float, odometry: Float, points: Sequence[Float]) -> float:
         points: From `lidar_path`.
     """
     square = round(yaw / (math.pi / 2.0)) * (math.pi / 2.0)
+    if abs(yaw - square) > _YAW_ERROR or np.ptp(np.unwrap(odometry[:, 2])) > _STRAIGHT:
+        return yaw
     by_yaw, by_square = (overlap(odometry + np.array([0.0, 0.0, turn]), points) for turn in (yaw, square))
-    return float(wrap_angle(square)) if by_square >= by_yaw else yaw
+    return float(wrap_angle(square)) if by_square > by_yaw + _BETTER else yaw
 
 
 def _step(start: Float, end: Float) -> Float:

@@ -107,13 +107,12 @@ class Container:
         return self.messages(numbers, self.tail_ns(numbers, count), {})
 
     def spread(self, numbers: Collection[int], most: int) -> Iterator[Message]:
-        """Yield messages of some channels that are evenly spaced over the recording, at most `most`; those
-        that cannot be read are left out. SourceError if the file cannot be read."""
-        rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
-        for k in np.unique(np.linspace(0, max(len(rows) - 1, 0), min(most, len(rows))).astype(np.int64)):
-            message = self._message(*self.index[rows[k]].tolist())
-            if message is not None:
-                yield replace(message, payload=plain(message.payload))
+        """Yield messages of some channels, evenly spaced by their number, at most `most`; those that cannot
+        be read are left out. SourceError if the file cannot be read."""
+        times_ns = self.index[np.isin(self.index[:, 0], list(numbers)), 1]
+        rows = np.linspace(0, max(len(times_ns) - 1, 0), min(most, len(times_ns))).astype(np.int64)
+        for start_ns in np.unique(times_ns[rows]).tolist():
+            yield from islice(self.messages(numbers, start_ns, {}), 1)
 
     def tail_ns(self, numbers: Collection[int], last: int = TAIL) -> int:
         """Return the time of recording [ns] of the `last` message from the end of some channels, of the first

@@ -177,7 +177,7 @@ class RosSource(MessageSource):
         decoder.levels = _is_upright(messages, decoder)
         tilt, body = TiltCheck(), tuple[str, ...]()
         if not live and not odometry.world and sensor.rings != 1:
-            is_recorded = tree.find(mounting.base, found.frame) is not None
+            is_recorded = mounting.base != found.frame and tree.find(mounting.base, found.frame) is not None
             is_recorded = is_recorded and not mounting.is_measured and options.T_base_lidar is None
             scans_of_run = spread_scans(messages, decoder, found.frame, T_base_lidar)
             tilt = check_tilt(messages, decoder, scans_of_run, is_recorded=is_recorded)

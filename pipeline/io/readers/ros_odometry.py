@@ -74,7 +74,7 @@ def nearness(
     frame, child = frames[topic.name]
     if scans is None:
         maps = {parent for name, (parent, robot) in frames.items() if robot and name != topic.name}
-        robots = (*(child for _, child in frames.values() if child), *USUAL_BASES)
+        robots = (*USUAL_BASES, *(child for _, child in frames.values() if child))
         placed = (T for robot in robots if robot != frame and (T := tree.find(robot, frame)) is not None)
         T_base_lidar = next(placed, Pose3.identity())
         is_upright = abs(T_base_lidar.R[2, 2]) > _UPRIGHT

@@ -12,19 +12,19 @@ from pipeline.io.readers.ros_messages import TimedMessages
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.types.records import Float, Imu, Scan
 
-#: Scans that are checked, evenly spaced over the recording: a slope changes on the way, the axes of a sensor
-#: do not.
+#: Scans that are checked, from all over the recording, and fewest of them that show trunks: a slope changes
+#: on the way, the axes of a sensor do not.
 _SCANS, _FEWEST = 8, 5
 #: Largest age of the reading of an IMU [ns].
 _STALE_NS = 500_000_000
-#: Least angle between gravity and the mean of trunks that shows wrong axes, and largest angle of single
-#: scans to the mean [rad]. Trunks of a scan lean by 1 to 4 degrees on average, also on a slope.
+#: Least tilt that shows wrong axes, and largest angle of single scans to the mean, and of ground to trunks
+#: [rad]. Trunks of a scan lean by 1 to 4 degrees on average, also on a slope.
 _TILTED, _ALIKE = np.radians(8.0), np.radians(6.0)
 #: Trunks are upright within this [rad].
 _UPRIGHT = np.radians(4.0)
 #: Largest distance of points of the ground, side of cells of which the lowest points are taken [m], fewest
-#: cells, height above the plane up to which a lowest point is ground [m], and turns of the fit.
-_NEAR, _CELL, _CELLS, _EVEN, _TURNS = 8.0, 1.0, 20, 0.15, 5
+#: cells, distance from the plane up to which a lowest point is ground [m], and number of fits.
+_NEAR, _CELL, _CELLS, _EVEN, _FITS = 8.0, 1.0, 20, 0.15, 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +32,8 @@ class TiltCheck:
     """What ground and trunks say about the levelling of the scans.
 
     Attributes:
-        scans: Number of scans that contradict the fixed transforms, or these and the IMU; 0 for none.
-        reason: Why they do, and what helps; "" without contradiction.
+        scans: Number of scans of the recording, if ground and trunks contradict their levelling; else 0.
+        reason: How they do, and what helps; "" without contradiction.
         uses_imu: Whether the orientation of the IMU can be used.
         warnings: Messages for the user.
     """
@@ -47,16 +47,18 @@ class TiltCheck:
 def spread_scans(
     messages: TimedMessages, decoder: RecordDecoder, lidar: str, T_base_lidar: Pose3
 ) -> list[tuple[int, Float]]:
-    """Return times of recording [ns] and points of up to _SCANS scans, evenly spaced over the recording,
-    about the sensor with the axes of the base, shape (N, 3) each [m]. SourceError if the file cannot be read.
+    """Return times of recording [ns] and points of about _SCANS scans from all over the recording, about the
+    sensor with the axes of the base, shape (N, 3) each [m]. SourceError if the file cannot be read.
 
     Args:
         messages, decoder: The messages and their decoder.
         lidar: Frame of the LiDAR; scans of others are left out.
         T_base_lidar: Mounting of the LiDAR.
     """
-    found = messages.container.spread(messages.odometry.topics.numbers("scan"), _SCANS)
-    records = [(m.log_ns, decoder.record(m, 0, {})) for m in found if messages.frame_of(m) == lidar]
+    # Twice as many, for a topic that two LiDARs share; an odd number, since they may take turns.
+    found = messages.container.spread(messages.odometry.topics.numbers("scan"), 2 * _SCANS + 1)
+    own = [message for message in found if messages.frame_of(message) == lidar]
+    records = [(m.log_ns, decoder.record(m, 0, {})) for m in own[:: max(round(len(own) / _SCANS), 1)]]
     return [
         (log_ns, scan.points.astype(np.float64) @ T_base_lidar.R.T)
         for log_ns, scan in records
@@ -67,56 +69,50 @@ def spread_scans(
 def check_tilt(
     messages: TimedMessages, decoder: RecordDecoder, scans: list[tuple[int, Float]], *, is_recorded: bool
 ) -> TiltCheck:
-    """Check the tilt of the mounting by the ground, on which the robot stands, and gravity by the IMU by the
-    trunks, which are vertical on average.
+    """Check whether scans are level by the fixed transforms and the orientation of the IMU.
+
+    The levelling is contradicted if ground and trunks are tilted alike in the same direction throughout the
+    drive. On a slope only the trunks lean in the frame of the robot, on a road along a hillside only the
+    ground does, and in a stand whose stems lean only these.
 
     Args:
         messages, decoder: The messages and their decoder, with the base frame.
         scans: From `spread_scans`.
         is_recorded: Whether the mounting is that of fixed transforms.
     """
-    grounds = [ground for _, points in scans if (ground := _ground_of(points)) is not None]
-    if is_recorded and (tilt := _common_tilt(grounds)):
-        return TiltCheck(
-            messages.odometry.topics.chosen["scan"].count,
-            f"scans in which the ground below the robot is tilted by {np.degrees(tilt):.0f} degrees in the "
-            "same direction throughout the drive: the fixed transform of the LiDAR is wrong; give its pose "
-            "with --mount",
-        )
-    return _check_imu(messages, decoder, scans)
-
-
-def _check_imu(messages: TimedMessages, decoder: RecordDecoder, scans: list[tuple[int, Float]]) -> TiltCheck:
-    """Return what the trunks in scans, points in the base frame with the time of recording [ns], say about
-    the orientation of the IMU."""
-    numbers, trunks, leaning = messages.odometry.topics.numbers("imu"), list[Float](), list[Float]()
+    numbers = messages.odometry.topics.numbers("imu")
+    trunks, leaning, grounds = list[Float](), list[Float](), list[Float]()
     for log_ns, points in scans:
-        R_level_base = _levelling_near(messages, decoder, numbers, log_ns)
-        if R_level_base is None:
+        if (up := _up_of(points)) is None:
             continue
-        up = _up_of(points @ R_level_base.T)
-        if up is not None:
-            leaning.append(up)
-            trunks.append(R_level_base.T @ up)
+        R_level_base = _levelling_near(messages, decoder, numbers, log_ns)
+        trunks.append(up)
+        if R_level_base is not None:
+            leaning.append(R_level_base @ up)
+        if (ground := _ground_of(points, up)) is not None:
+            grounds.append(ground if R_level_base is None else R_level_base @ ground)
     lean = _common_tilt(leaning)
-    if not lean:
-        return TiltCheck()
-    name = messages.odometry.topics.chosen["imu"].name
-    degrees = f"{np.degrees(lean):.0f} degrees"
-    mean = np.mean(trunks, axis=0)
-    if mean[2] > np.cos(_UPRIGHT) * np.linalg.norm(mean):
+    imu = messages.odometry.topics.chosen["imu"].name if leaning else ""
+    upright = np.mean(trunks, axis=0) if trunks else np.zeros(3)
+    if lean and upright[2] > np.cos(_UPRIGHT) * np.linalg.norm(upright):
         return TiltCheck(
             uses_imu=False,
             warnings=(
-                f"by the orientation in {name} all trunks would lean by {degrees}, which they do not without "
-                "it: it is not used (the fixed transform of its frame is wrong or missing)",
+                f"by the orientation in {imu} all trunks would lean by {np.degrees(lean):.0f} degrees, which "
+                "they do not without it: the orientation is not used",
             ),
         )
+    stems = leaning if leaning else trunks
+    tilt = _common_tilt(grounds)
+    if not (is_recorded or leaning) or not tilt or not _common_tilt(stems):
+        return TiltCheck()
+    if np.mean(grounds, axis=0) @ np.mean(stems, axis=0) < np.cos(_ALIKE):
+        return TiltCheck()
+    wrong = f"the orientation in {imu} or the fixed transforms are" if imu else "the fixed transform is"
     return TiltCheck(
         messages.odometry.topics.chosen["scan"].count,
-        f"scans whose trunks lean by {degrees} in the same direction throughout the drive, by the "
-        f"orientation in {name}: it or the fixed transforms are wrong; give the pose of the LiDAR with "
-        "--mount",
+        f"tilts of scans whose ground and trunks are tilted by {np.degrees(tilt):.0f} degrees in the same "
+        f"direction throughout the drive: {wrong} wrong; give the pose of the LiDAR with --mount",
     )
 
 
@@ -145,21 +141,23 @@ def _up_of(points: Float) -> Float | None:
     from pipeline.odometry.mounting_yaw import standing_height
 
     near, height = standing_height(points)
-    return vertical_of(near[(height > BARK[0]) & (height < BARK[1])])
+    up = vertical_of(near[(height > BARK[0]) & (height < BARK[1])])
+    return up if up is not None and up.any() else None
 
 
-def _ground_of(points: Float) -> Float | None:
-    """Return the normal of the ground about the sensor, upwards, shape (3,), None without trunks or ground.
+def _ground_of(points: Float, up: Float) -> Float | None:
+    """Return the normal of the ground about the sensor, upwards, shape (3,), None without ground.
 
     The ground is the plane through the lowest points of cells that are level by the trunks.
 
     Args:
         points: As in `_up_of`.
+        up: The vertical by the trunks, shape (3,).
     """
     from pipeline.odometry.lidar_odometry import levelling
 
-    near, up = points[np.linalg.norm(points, axis=1) < _NEAR], _up_of(points)
-    if up is None or len(near) < _CELLS:
+    near = points[np.linalg.norm(points, axis=1) < _NEAR]
+    if len(near) < _CELLS:
         return None
     R = levelling(up)
     level = near @ R.T
@@ -169,12 +167,12 @@ def _ground_of(points: Float) -> Float | None:
     lowest = lowest[np.concatenate(([True], (np.diff(cell, axis=0) != 0).any(axis=1)))]
     kept, plane = np.ones(len(lowest), np.bool_), np.zeros(3)
     A = np.column_stack([lowest[:, :2], np.ones(len(lowest))])
-    for _ in range(_TURNS):  # cells without ground have higher lowest points
+    for _ in range(_FITS):  # cells without ground have higher lowest points, those beside a road lower ones
         if np.count_nonzero(kept) < _CELLS:
             return None
         plane = np.linalg.lstsq(A[kept], lowest[kept, 2], rcond=None)[0]
         off = lowest[:, 2] - A @ plane
-        kept = off < max(float(np.median(off[kept])) + _EVEN, _EVEN)
+        kept = np.abs(off - np.median(off[kept])) < _EVEN
     normal = np.array([-plane[0], -plane[1], 1.0]) @ R
     return normal / np.linalg.norm(normal)
 
@@ -184,7 +182,8 @@ def _common_tilt(ups: list[Float]) -> float:
     the vectors are fewer than _FEWEST, or one of them is farther than _ALIKE from the mean."""
     if len(ups) < _FEWEST:
         return 0.0
-    mean = np.mean(ups, axis=0) / np.linalg.norm(np.mean(ups, axis=0))
+    mean = np.mean(ups, axis=0)
+    mean /= max(float(np.linalg.norm(mean)), 1e-9)
     tilt = float(np.arccos(np.clip(mean[2], -1.0, 1.0)))
     is_alike = bool((np.array(ups) @ mean > np.cos(_ALIKE)).all())
     return tilt if tilt >= _TILTED and is_alike else 0.0

@@ -156,7 +156,7 @@ def open_text(path: Path) -> PointTable:
 def _is_ptx(head: bytes) -> bool:
     """Return whether a text begins with the header of a PTX station: columns and rows of the scan, four lines
     of three numbers (position and axes), four lines of four numbers (transform)."""
-    widths = [len(line.split()) for line in head.splitlines()[:10]]
+    widths = [len(line.split()) for line in head.splitlines() if line.strip()][:10]
     return widths == [1, 1, 3, 3, 3, 3, 4, 4, 4, 4]
 
 

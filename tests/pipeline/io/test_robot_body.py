@@ -47,3 +47,11 @@ def test_a_forest_alone_shows_no_robot(seed: int):
 def test_a_robot_that_stands_shows_nothing(n: int):
     posts = np.array([[-2.2, 0.9]])
     assert reach_of_body(scans_of(np.zeros((n, 2)), posts, np.random.default_rng(0))) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_dense_low_plants_all_around_are_no_robot(seed: int):
+    rng = np.random.default_rng(seed)
+    plants = [rng.uniform([-4.0, -4.0, -1.1], [4.0, 4.0, -0.4], (60_000, 3)) for _ in range(8)]
+    scans = scans_of(walked(8), np.zeros((0, 2)), rng)
+    assert body_words([np.concatenate(pair) for pair in zip(scans, plants, strict=True)]) == ()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import pytest
 
 from pipeline.odometry.mounting_yaw import better_yaw
 
 
-@pytest.mark.parametrize("true", [0.0, 90.0, 180.0, 30.0, -20.0])
-@pytest.mark.parametrize("error", [-9.0, 0.0, 9.0])
+@pytest.mark.parametrize(
+    ("true", "error"),
+    [*product([0.0, 90.0, 180.0, 30.0, -20.0], [-9.0, 0.0, 9.0]), (5.0, 0.0), (6.0, 0.0), (84.0, 0.0)],
+)
 def test_a_right_angle_replaces_a_yaw_of_a_bad_registration_if_the_scans_overlap_more(
     true: float, error: float
 ):
