@@ -60,10 +60,16 @@ def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Fl
     not above HOUSING.
     """
     points = step.scan.points
-    rows = _rows_in_range(points, min(HOUSING, parameters.range_min), parameters.range_min)
+    below = np.nextafter(parameters.range_min**2, 0.0)
+    rows = _rows_in_range(points, min(HOUSING, parameters.range_min) ** 2, below)
     R_level_lidar, _ = _level_rotation(step, T_base_lidar, parameters)
     near: Float32 = (points[rows] @ R_level_lidar.T).astype(np.float32)
     return near
+
+
+def acquired_rows(step: Step, parameters: Acquisition) -> Int32:
+    """Return the rows of the points of a scan that `acquire` keeps, int32, shape (N,), ascending."""
+    return _rows_in_range(step.scan.points, parameters.range_min**2, parameters.range_max**2)
 
 
 def _level_rotation(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
@@ -92,14 +98,14 @@ def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, fl
 
 
 @compiled
-def _rows_in_range(points: Float32, least: float, below: float) -> Int32:
-    """Return the ascending rows, int32, shape (M,), of the points (shape (N, 3) [m]) with `least` <= range <
-    `below` [m]; without rows of NaN."""
+def _rows_in_range(points: Float32, square_min: float, square_max: float) -> Int32:
+    """Return the ascending rows, int32, shape (M,), of the points (shape (N, 3) [m]) with a squared range
+    from `square_min` to `square_max` [m^2], both inclusive; without rows of NaN."""
     rows = np.empty(points.shape[0], np.int32)
     n = 0
     for i in range(points.shape[0]):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if least * least <= x * x + y * y + z * z < below * below:
+        if square_min <= x * x + y * y + z * z <= square_max:
             rows[n] = i
             n += 1
     return rows[:n].copy()

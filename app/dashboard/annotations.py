@@ -15,7 +15,7 @@ from app.batch.run_edits import SAME_THING
 from app.store.async_store import AsyncStore
 from app.store.records import FRAME, KINDS, REPAIR, SKIPPED, Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError
-from pipeline.repairs.record import Repair
+from pipeline.repairs.record import Repair, identity_of
 from pipeline.types.records import TruthTrees
 
 if TYPE_CHECKING:
@@ -290,7 +290,8 @@ class AnnotationEditor:
         `counted`; `own`, the number of objects in the ground truth of the source, None if there is none;
         `contradicting`, the result of this function; `same_thing_m`, SAME_THING; `trees` and `skipped`, lists
         of `row_payload`; `others`, a dict from the class of each of `others` to a list of `values_payload`;
-        and `frame`, the `values_payload` of `frame`, None for a local map.
+        `repairs`, the `identity_of` the repairs; and `frame`, the `values_payload` of `frame`, None for a
+        local map.
         """
         return {
             "run": self.run,
@@ -307,6 +308,7 @@ class AnnotationEditor:
                 kind: [values_payload(row) for row in self.others if row.content.kind == kind]
                 for kind in sorted({row.content.kind for row in self.others})
             },
+            "repairs": identity_of(self.repairs),
             "frame": None if self.frame is None else values_payload(self.frame),
         }
 

@@ -165,9 +165,10 @@ class ParameterState:
 
     def suit(self, name: str, source: str = "") -> bool:
         """Use the preset that suits a source, unless a person has chosen the values in force or the preset
-        cannot be used. Return whether `as_plain` differs now. It is no undo step; after an undo or a reset of
-        all changes nothing counts as chosen. Of the steps of another source only those that lead back from
-        the values in force stay.
+        cannot be used. Return whether `as_plain` may differ now. It is no undo step; after an undo or a reset
+        of all changes nothing counts as chosen. The steps are forgotten if a preset is put in force. For
+        another source the undone steps are forgotten, and the steps to undo unless the values in force were
+        chosen.
 
         Args:
             name: The preset.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from app.explain.records import half_axes
 from app.worker.course import QUANTITIES
 from app.worker.protocol import RunCourse, Shown
+from pipeline.repairs.record import identity_of
 from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict
 from pipeline.types.units import SECOND_NS
 
@@ -30,8 +31,8 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
     lists [x [m], y [m], yaw [rad]] of `T_map_base` and `T_odom_base`; `sigma_xy`, the root mean square of the
     standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; `health`, `trees`, `clusters`,
     `layers` and `clearance`, the results of the functions of this module; `loops`, pairs of scans,
-    `problems` and `repaired_numbers`, as in `Shown`; `intensity`, whether the returns have one;
-    and the keys of `counts_of`.
+    `problems` and `repaired_numbers`, as in `Shown`; `repairs`, the `identity_of` the repairs to which they
+    belong; `intensity`, `has_intensity` of `Shown`; and the keys of `counts_of`.
 
     Args:
         shown: The scan with the map.
@@ -54,8 +55,9 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         **counts_of(frame, truth, match_distance),
         "layers": layer_counts(frame),
         "clearance": clearance_payload(frame.clearance),
-        "intensity": shown.reflectance is not None,
+        "intensity": shown.has_intensity,
         "loops": shown.loops.tolist(),
+        "repairs": identity_of(shown.repairs),
         "problems": list(shown.problems),
         "repaired_numbers": [list(numbers) for numbers in shown.repaired_numbers],
     }

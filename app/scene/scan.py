@@ -54,7 +54,7 @@ class ScanNodes:
         frame: Frame,
         view: ViewSettings,
         labelled: Sequence[Place],
-        reflectance: NDArray[np.float32] | None = None,
+        reflectance: NDArray[np.uint8] | None = None,
     ) -> None:
         """Show a scan. Without a drive, points of clusters are not shown as filtered points, and clusters
         have neither labels nor fitted circles.
@@ -63,7 +63,7 @@ class ScanNodes:
             frame: Results of the scan.
             view: Visible layers, colours and labels.
             labelled: Positions of the labels of trees, see `cluster_labels`.
-            reflectance: Of the raw points, shape (N,), in the scale of the sensor; None if unknown.
+            reflectance: Of the raw points, uint8, shape (N,); None if unknown.
         """
         layers = view.layers
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
@@ -77,9 +77,8 @@ class ScanNodes:
         of_clusters = cluster_colours(frame, numbers, view.colour_by)
         if view.colour_by == "height":
             of_raw, of_filtered = colours.ramp(frame.raw[:, 2], *height_range(frame)), of_clusters[rest]
-        elif view.colour_by == "intensity" and reflectance is not None and len(reflectance):
-            of_raw, of_clusters = by_intensity(frame.raw, reflectance, frame.filtered)
-            of_filtered = of_clusters[rest]
+        elif view.colour_by == "intensity" and reflectance is not None:
+            of_raw = colours.ramp(np.arange(256.0), 0.0, 255.0)[reflectance]
         self._raw.show(layers["raw"], raw, of_raw)
         self._filtered.show(
             layers["filtered"],
@@ -184,23 +183,13 @@ def height_range(frame: Frame) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def by_intensity(
-    raw: NDArray[np.float32], reflectance: NDArray[np.float32], filtered: NDArray[np.float32]
-) -> tuple[Colours, Colours]:
-    """Return the colours of raw and filtered points by reflectance, uint8, shapes (N, 3) and (M, 3). The ends
-    of the ramp are the percentiles 1 and 99; a filtered point has the colour of the nearest raw point."""
-    from scipy.spatial import cKDTree
-
-    found = colours.ramp(reflectance, *np.percentile(reflectance, (1.0, 99.0)).tolist())
-    return found, found[cKDTree(raw).query(filtered)[1]]
-
-
 def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:
     """Return the colours of the filtered points, uint8, shape (M, 3).
 
     By "height", each point is coloured by its height. Otherwise it has the colour of its cluster, or FILTERED
     without a cluster: by its number ("cluster"), the logarithm of its eccentricity, clipped to 1 to 100, with
-    NaN as 1 ("eccentricity"), whether it is a detection ("stage"), or else its verdict.
+    NaN as 1 ("eccentricity"), whether it is a detection ("stage"), CLUSTERED ("intensity", which raw points
+    show), or else its verdict.
 
     Args:
         frame: Results of the scan.
@@ -214,9 +203,10 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
         table = colours.by_category(numbers)
     elif colour_by == "eccentricity":  # 1 is round, 100 a line
         table = colours.ramp(np.log10(np.fmax(clusters.eccentricity, 1.0)), 0.0, 2.0)
-    elif colour_by == "stage":
+    elif colour_by in ("stage", "intensity"):
         table = np.tile(np.array([colours.CLUSTERED], dtype=np.uint8), (len(clusters.size), 1))
-        table[frame.detections.cluster] = colours.TREE
+        if colour_by == "stage":
+            table[frame.detections.cluster] = colours.TREE
     else:
         table = colours.by_verdict(clusters.verdict)
     return colours.of_points(table, frame.labels, colours.FILTERED)

@@ -51,7 +51,7 @@ class Scene:
         self._tuning = PanelCommands(commands, self._put_back)
         self._parameters, self._preset = preset("forest"), "forest"
         self._frame: Frame | None = None
-        self._reflectance: NDArray[np.float32] | None = None
+        self._reflectance: NDArray[np.uint8] | None = None
         self._path: Float = np.zeros((0, 4))
         self._truth: TruthTrees | None = None
         self._selected: int | None = None
@@ -69,7 +69,7 @@ class Scene:
         """Number of messages that viser has numbered since it was started."""
         return messages_sent(self._server)
 
-    def show(self, frame: Frame, path: Float, reflectance: NDArray[np.float32] | None = None) -> None:
+    def show(self, frame: Frame, path: Float, reflectance: NDArray[np.uint8] | None = None) -> None:
         """Show the results of a scan. The first one sets the distance of the cameras to the extent of a whole
         cloud. After RENEW_AFTER messages viser is restarted first, and `port` changes.
 
@@ -77,7 +77,7 @@ class Scene:
             frame: Results of the scan.
             path: Positions of the robot at all scans: x, y in the frame of the map and x, y by odometry, NaN
                 where unknown, shape (N, 4) [m].
-            reflectance: Of the raw points, shape (M,), in the scale of the sensor; None if unknown.
+            reflectance: Of the raw points, uint8, shape (M,); None if unknown.
         """
         first = self._frame is None
         self._frame, self._path, self._reflectance = frame, path, reflectance

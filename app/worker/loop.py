@@ -411,23 +411,22 @@ class WorkerLoop:
         session, path, repaired = self._session, self._session.shown.path, self._session.shown.repaired
         frame = None if frame is None else session.shown.frame
         if frame is not None and path is not None:
-            of_trees, counts = session.shown.confirmed_s, session.shown.counts
-            odometry_xy = session.shown.odometry_xy[: len(path.x)]
             self._put(
                 protocol.Shown(
-                    self._run,
-                    session.shown.time_s,
-                    frame,
-                    0,
-                    path,
-                    of_trees,
-                    counts,
-                    odometry_xy,
-                    () if repaired is None else repaired.problems,
-                    session.shown.loops,
-                    () if repaired is None else session.shown.repairs,
-                    () if repaired is None else repaired.numbers,
-                    session.shown.reflectance,
+                    run=self._run,
+                    time_s=session.shown.time_s,
+                    frame=frame,
+                    path_start=0,
+                    path=path,
+                    confirmed_s=session.shown.confirmed_s,
+                    counts=session.shown.counts,
+                    odometry_xy=session.shown.odometry_xy[: len(path.x)],
+                    problems=() if repaired is None else repaired.problems,
+                    loops=session.shown.loops,
+                    repairs=() if repaired is None else session.shown.repairs,
+                    repaired_numbers=() if repaired is None else repaired.numbers,
+                    reflectance=session.shown.reflectance,
+                    has_intensity=None if session.run is None else session.run.has_intensity,
                 )
             )
 

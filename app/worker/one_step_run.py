@@ -42,6 +42,7 @@ class OneStepRun:
     start_ns = 0
     path: Path = NO_PATH
     reflectance = None
+    has_intensity = False
     odometry_xy: Float = np.zeros((0, 2))
     cache_notice = ""
 
@@ -61,11 +62,6 @@ class OneStepRun:
     def share(self) -> float | None:
         """Share of the map under way that is done, from 0 to 1; None if none is computed."""
         return None if self._job is None else self._share
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Dict from a reason to the number of points that were left out for it."""
-        return self.source.losses
 
     def counts(self, index: int) -> RunCounts:
         """Return the counts of the present map; empty before it is complete."""

@@ -14,6 +14,7 @@ from typing import Annotated, Any, BinaryIO, Generic, Literal, TypeVar, get_args
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from app.explain.records import ClusterStory, MapSection, TreeStory
 from app.sources.one_step import OneStep
@@ -21,7 +22,9 @@ from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 from pipeline.repairs.record import Repair
 from pipeline.types.camera import Camera, Picture
-from pipeline.types.records import Float, Float32, Frame, Int, Path, Trees, TruthTrees
+from pipeline.types.records import Float, Frame, Int, Path, Trees, TruthTrees
+
+Bytes = NDArray[np.uint8]
 
 # Beyond any run, and well inside of an int64 of nanoseconds.
 LONGEST_S = 1e9
@@ -251,7 +254,8 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
         repairs: The repairs to which `problems` belongs.
         repaired_numbers: Numbers of the trees that each of them is about, see `RepairedMap`.
-        reflectance: Of the raw points, float32, shape (N,), in the scale of the sensor; None if unknown.
+        reflectance: Of the raw points, uint8, shape (N,), see `reflectance_of`; None if unknown.
+        has_intensity: Whether scans of the run have reflectances; None before the first scan.
     """
 
     run: int
@@ -266,7 +270,8 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     loops: Int = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
     repairs: tuple[Repair, ...] = ()
     repaired_numbers: tuple[tuple[int, ...], ...] = ()
-    reflectance: Float32 | None = None
+    reflectance: Bytes | None = None
+    has_intensity: bool | None = None
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):
@@ -529,7 +534,7 @@ M = TypeVar("M")
 LENGTH_BYTES = 4
 # A scan of 4 million points with all its layers, more than any sensor produces.
 LARGEST_MESSAGE = 128 * 1024 * 1024
-_DTYPES = frozenset({"<f4", "<f8", "<i4", "<i8", "|b1"})
+_DTYPES = frozenset({"<f4", "<f8", "<i4", "<i8", "|b1", "|u1"})
 _MOST_DIMENSIONS = 4
 
 

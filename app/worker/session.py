@@ -181,7 +181,8 @@ class Session:
         except BaseException:
             source.close()
             raise
-        self.shown.run, self._state, self._detail = run, "paused", ""
+        self.shown.begin(run)
+        self._state, self._detail = "paused", ""
         self.unmapped = 0
         if isinstance(run, Run):
             self._is_segmenting = next(self._compiling, False)
@@ -436,7 +437,7 @@ class Session:
         self._remaps_on_arrival = False
         self._warnings.clear()
         self._target.forget()
-        self.shown.begin(None)
+        self.shown.close()
 
     def end_recording(self) -> bool:
         """Finish the recording of a live run, which waits up to 8 s for the disk, and return whether the run
@@ -524,7 +525,7 @@ def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | Non
         scans=description.scans,
         mapping_ms=round(run.stopwatch.scan_ms, 3),
         stage_ms={stage: round(ms, 3) for stage, ms in run.stopwatch.stage_ms.items()},
-        scans_left_out=sum(scans_left_out(run.losses).values()),
+        scans_left_out=sum(scans_left_out(run.losses).values()) if isinstance(run, Run) else 0,
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
         distance_m=distance_m,
         health=health_word(frame, distance_m),

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from app.worker.one_step_run import OneStepRun
-from app.worker.protocol import RunCounts, Shown
+from app.worker.protocol import Bytes, RunCounts, Shown
 from app.worker.run import Run
 from pipeline.config import Parameters
 from pipeline.repairs.record import Repair
@@ -83,8 +83,8 @@ class ShownMap:
         return found
 
     @property
-    def reflectance(self) -> Float32 | None:
-        """Reflectance of the raw points of `frame`, float32, shape (N,); None where it is unknown."""
+    def reflectance(self) -> Bytes | None:
+        """Reflectance of the raw points of `frame`, see `reflectance_of`; None where it is unknown."""
         shown = self._kept or self.run
         return None if shown is None else shown.reflectance
 
@@ -189,9 +189,14 @@ class ShownMap:
         """Show the current scan of the run."""
         self._kept = None
 
-    def begin(self, run: AnyRun | None) -> None:
-        """Show another run without repairs; None shows nothing."""
+    def begin(self, run: AnyRun) -> None:
+        """Show a run before its first scan, with the repairs that were set while it was awaited."""
         self.run, self._kept = run, None
+        self.forget_repaired()
+
+    def close(self) -> None:
+        """Show nothing, and forget the repairs."""
+        self.run, self._kept = None, None
         self.repairs, self._faults = (), {}
         self.forget_repaired()
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Any, Literal, get_args
+from zlib import crc32
 
 import msgspec
 import numpy as np
@@ -76,6 +77,11 @@ def repairs_text(repairs: Sequence[Repair]) -> str:
     """Return repairs as the text of a file, which `read_repairs` reads."""
     rows = ",\n".join("  " + msgspec.json.encode(repair).decode() for repair in repairs)
     return f'{{"repairs": [\n{rows}\n]}}\n' if repairs else '{"repairs": []}\n'
+
+
+def identity_of(repairs: Sequence[Repair]) -> int:
+    """Return a number from 0 to 2^32 - 1 that is the same for equal repairs in the same order."""
+    return crc32(msgspec.json.encode(repairs))
 
 
 def parse_repairs(text: str, where: str) -> tuple[Repair, ...]:
@@ -167,10 +173,13 @@ def seen_from(trees: Trees, path: Path, place: tuple[float, float]) -> tuple[int
 
 
 def tied_numbers(trees: Trees, path: Path, repair: Repair) -> tuple[int, ...]:
-    """Return the numbers of the trees of a map that a "tie" makes one; those not in the map are left out."""
+    """Return the numbers of the trees of a map that a "tie" makes one; those not in the map, and those seen
+    when it has no scan, are left out."""
     rows = list[int | None]()
     for stamp, place in zip(repair.stamps_ns, repair.places, strict=False):  # "forbid" has no places
-        scan = min(int(np.searchsorted(path.stamp_ns, stamp)), len(path.x) - 1)
+        if not len(path.x) or not path.stamp_ns[0] <= stamp <= path.stamp_ns[-1]:
+            continue
+        scan = int(np.searchsorted(path.stamp_ns, stamp))
         pose = Pose2(float(path.x[scan]), float(path.y[scan]), float(path.yaw[scan]))
         x, y = pose.apply(np.array(place)).tolist()
         rows.append(nearest_tree(trees, (x, y), confirmed=True))

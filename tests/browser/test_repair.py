@@ -107,7 +107,7 @@ def test_each_repair_changes_the_map_and_is_undone_and_redone(person: Dashboard)
     expect(listed.locator(".grow")).to_have_text(
         [
             f"tree {f['number']} deleted",
-            f"tree {e['number']} is a pole",
+            f"tree {e['number']}: class pole",
             f"tree {d['number']} moved",
             f"tree {c['number']} split",
             f"tree {b['number']} merged into tree {a['number']}",
@@ -184,4 +184,6 @@ def test_a_repair_that_does_not_apply_says_so(person: Dashboard):
     )
     person.page.evaluate(send, ["delete", [[500.0, 0.0]]])
     expect(person.page.locator("#repair-count")).to_have_text("1 repair, 1 not applied")
-    expect(person.page.locator("#repairs li")).to_contain_text("no tree is within 0.5 m of 500.00, 0.00")
+    expect(person.page.locator("#repairs li")).to_contain_text(
+        "delete a tree at 500.0, 0.0Not applied: no tree is within 0.5 m of 500.00, 0.00"
+    )

@@ -38,7 +38,7 @@ LIVE = """async busy => {
     mapping_ms: 0, distance_m: 0 };
   state.status = { ...state.status, state: busy ? 'playing' : 'waiting', live: true, robot: 'forwarder-07',
     robots: [], ...figures };
-  state.evaluation = null;
+  state.evaluation = state.truth = null;
   changed('status');
 }"""
 
@@ -110,6 +110,7 @@ def test_the_strip_of_a_live_run_is_whole_and_nothing_in_it_moves(mapped: Dashbo
             shown = {name for name, _ in places[1][1:]}
             assert shown == {"trees", "health", "driven", "behind", "mapping", "rate", "sigma"}
             expect(page.locator("[data-figure=behind] dt")).to_have_text("behind, 1234 left out")
+            expect(page.locator("#state")).to_have_attribute("title", "Live forwarder-07")
         if width == 390:
             assert places[1][0] < 0.15 * height
 

@@ -55,7 +55,7 @@ def test_the_whole_map_is_shown_and_home_returns_to_the_first_view(dashboard: Da
     dashboard.page.evaluate(CHOOSE, ["colour_by", "eccentricity"])
     expect(page.locator("#colour-bar")).to_contain_text("Eccentricity e of a cluster")
     dashboard.page.evaluate(CHOOSE, ["colour_by", "intensity"])
-    expect(page.locator("#colour-bar")).to_contain_text("Intensity of the returns")
+    expect(page.locator("#colour-bar")).to_contain_text("Intensity of the raw points")
     dashboard.page.evaluate(CHOOSE, ["colour_by", "verdict"])
     expect(page.locator("#colour-bar")).to_be_hidden()
 

@@ -80,6 +80,7 @@ export function edit(work) {
     try {
       if (run !== state.annotations?.run) throw new Error("Another run was opened meanwhile: this edit belongs to the one before and was not made.");
       const done = await work();
+      if (run !== state.annotations?.run) return done; // the counts are those of the run before
       Object.assign(draft, { undo: done.undo, redo: done.redo });
       await arrived(done.serial);
       return done;
@@ -258,7 +259,8 @@ async function answer(tree, kind) {
   const { number } = tree, seen = annotationOf(tree);
   answering.add(number);
   draft.answer = { number, kind };
-  draft.answered = [...draft.answered.filter((each) => each !== number), number].slice(-MOST_ANSWERED);
+  const before = draft.answered;
+  draft.answered = [...before.filter((each) => each !== number), number].slice(-MOST_ANSWERED);
   const stored = edit(async () => {
     const row = annotationOf(tree); // after the edits before this one
     const isSeen = row && row.id === seen?.id && row.version === seen.version;
@@ -269,7 +271,10 @@ async function answer(tree, kind) {
   const given = draft.answer;
   try {
     if (state.selected === number) await next();
-    if (!await stored && draft.answer === given) draft.answer = null; // not that of a later tree
+    if (!await stored) {
+      if (draft.answer === given) draft.answer = null; // not that of a later tree
+      if (!before.includes(number)) draft.answered = draft.answered.filter((each) => each !== number);
+    }
   } finally {
     answering.delete(number);
     news();
@@ -305,7 +310,11 @@ export async function skip() {
 // The order needs the votes: a key pressed before they have arrived waits for them.
 async function next() {
   if (!votes.known) await updateVotes.now();
-  const tree = following();
+  lookAt(following());
+}
+
+// Shows a tree in the review; none stays where the review is.
+export function lookAt(tree) {
   draft.chosen = null;
   if (tree) select(tree.number);
   byId("panel-annotate").scrollTop = 0;
@@ -323,12 +332,12 @@ export function following() {
 // Selects the tree that was answered before the selected one; the newest answer if the selected tree has none.
 export function previous() {
   const numbers = answeredTrees().map(({ number }) => number), at = numbers.indexOf(state.selected);
-  const number = numbers.at(at < 0 ? -1 : Math.max(0, at - 1));
-  if (number !== undefined) select(number);
+  const tree = treeOf(numbers.at(at < 0 ? -1 : Math.max(0, at - 1)));
+  if (tree) lookAt(tree);
 }
 
-// The answered trees of the map, the newest last.
-export const answeredTrees = () => draft.answered.map(treeOf).filter(Boolean);
+// The answered trees of the map, the newest last; those whose answer was undone are open again.
+export const answeredTrees = () => draft.answered.map(treeOf).filter((tree) => tree && (annotationOf(tree) || answering.has(tree.number)));
 
 // What the last answer of the review said ("Tree 40: pole"); "" before the first one.
 export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${draft.answer.kind}` : "");

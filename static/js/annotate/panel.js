@@ -8,7 +8,7 @@ import { throttled } from "../core/timing.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, previous, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, startCard } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -22,7 +22,7 @@ let imported = ""; // result of the last import
 function build() {
   const kind = el("select", { id: "annotate-kind", "aria-label": "Class of a rejected tree", onchange: () => { draft.kind = kind.value; } },
     ...KINDS.slice(1).map((each) => el("option", { value: each, text: each, selected: each === draft.kind })));
-  kind.title = "Its letter answers at once: P pole, H person, B bush, O other";
+  kind.title = "Answered at once with Shift: P pole, H person, B bush, O other";
   const unit = el("select", { id: "annotate-unit", "aria-label": "Unit of a DBH column whose header names none" },
     ...[["", "unit of DBH in the file"], ["cm", "cm"], ["m", "m"], ["mm", "mm"]].map(([value, text]) => el("option", { value, text })));
   const file = el("input", { id: "annotate-file", type: "file", accept: ".csv,.txt,text/csv", hidden: true, "aria-label": "Table of trees", onchange: async () => {
@@ -158,10 +158,10 @@ function fillHistory() {
   if (box.dataset.now === now) return; // the focus stays on a button
   box.dataset.now = now;
   box.replaceChildren(button("review-previous", "Previous (R)", "Show the tree of the answer before, to change it (R)", previous, "quiet small"),
-    ...shown.map((tree) => el("button", { class: "quiet small", type: "button", "aria-pressed": String(tree.number === state.selected), text: `${tree.number} ${classOf(tree)}`, title: `Show tree ${tree.number} again`, onclick: () => select(tree.number) })));
+    ...shown.map((tree) => el("button", { class: "quiet small", type: "button", "aria-pressed": String(tree.number === state.selected), text: `${tree.number} ${classOf(tree)}`, title: `Show tree ${tree.number} again`, onclick: () => lookAt(tree) })));
 }
 
-const classOf = (tree) => annotationOf(tree)?.kind ?? "open";
+const classOf = (tree) => annotationOf(tree)?.kind ?? "…"; // its answer is on its way
 
 function hint(tree) {
   if (draft.adding) return "Click on the map where a tree is missing; the ring shows where it will be added. Scores count trees near the path only (Tune, Evaluation, Reach). Esc ends.";
@@ -199,11 +199,11 @@ export function startAnnotatePanel() {
 // --- keys of the tab; they act while it is open, unless a person types -----------------------------------
 
 const STEP = 0.01; // [m]
-const CLASS_KEYS = { p: "pole", h: "person", b: "bush", o: "other" }; // the letters of the verdicts
+const CLASS_KEYS = { P: "pole", H: "person", B: "bush", O: "other" }; // with Shift: p and b alone have other actions
 const ARROWS = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP] };
 
 export const ANNOTATE_KEYS = [
-  ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["p h b o", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
+  ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["shift+p shift+h shift+b shift+o", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
   ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "undo and redo an edit"], ["shift+click", "in the 3D scene: add a tree there"],
 ];
 

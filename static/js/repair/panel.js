@@ -15,10 +15,11 @@ const LOOPS = [
   ["tie", "Same place", "The robot was at one place twice and the map does not know it: click a stem, and the same stem seen again. Path and map follow"],
   ["forbid", "Forbid loop", "A loop of the map is wrong: click its dashed line. Path and map follow"],
 ];
-const WORDS = { merge: "two trees merged", split: "tree split", move: "tree moved", class: "class", delete: "tree deleted", tie: "same place", forbid: "loop forbidden" };
-// What a repair did to the trees with the numbers a and b.
+// What a repair asks for, also while it is not applied.
+const WORDS = { merge: "merge two trees", split: "split a tree", move: "move a tree", class: "class", delete: "delete a tree", tie: "same place", forbid: "forbid a loop" };
+// What an applied repair did to the trees with the numbers a and b.
 const DONE = {
-  merge: (a, b) => b && `tree ${b} merged into tree ${a}`, split: (a) => `tree ${a} split`, move: (a) => `tree ${a} moved`, class: (a, b, value) => `tree ${a} is a ${value}`,
+  merge: (a, b) => b && `tree ${b} merged into tree ${a}`, split: (a) => `tree ${a} split`, move: (a) => `tree ${a} moved`, class: (a, b, value) => `tree ${a}: class ${value}`,
   delete: (a) => `tree ${a} deleted`, tie: (a, b) => b && (a === b ? `tree ${a} at the same place` : `same place: trees ${a} and ${b}`), forbid: () => "",
 };
 const LARGEST_FILE = 900_000; // [bytes]
@@ -52,9 +53,9 @@ function build() {
       el("a", { id: "repair-save", class: "small", href: "/api/repairs.json", download: "repairs.json", text: "Save repairs", title: "A file for Import and for `stemmap map --repairs`" })));
 }
 
-// In the words of the trees where they are known, else of the place.
+// In the words of the trees where it is applied, else of the place.
 function wordsOf(row, [a, b] = []) {
-  const done = a && DONE[row.kind](a, b, row.value);
+  const done = a !== undefined && DONE[row.kind](a, b, row.value);
   if (done) return done;
   const place = isOfLoop(row) ? "" : ` at ${placeText(row)}`;
   return `${WORDS[row.kind]}${row.value ? ` ${row.value}` : ""}${place}`;
@@ -66,14 +67,14 @@ const placeText = (row) => row.places[0].map((v) => v.toFixed(1)).join(", ");
 function lineOf(row, problem, numbers) {
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete this repair", "aria-label": `Delete repair ${row.id}`, "data-edit": true, onclick: () => removeRepair(row) });
   return el("li", { "data-repair": row.id, class: problem ? "problem" : "", title: isOfLoop(row) ? "" : `at ${placeText(row)} m` },
-    el("span", { class: "grow" }, wordsOf(row, numbers), ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
+    el("span", { class: "grow" }, wordsOf(row, problem ? [] : numbers), ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
     el("span", { class: "dim", text: row.who }), gone);
 }
 
 function fill() {
   if (!repairing()) return;
   const rows = [...repairs()].sort((a, b) => a.id - b.id), problems = state.map?.problems ?? [];
-  const known = problems.length === rows.length; // else the map does not have them yet
+  const known = problems.length === rows.length && state.map?.repairs === state.annotations?.repairs; // else the map does not have them yet
   const left = known ? problems.filter(Boolean).length : 0;
   setText(byId("repair-count"), rows.length ? `${count(rows.length, "repair")}${left ? `, ${left} not applied` : ""}` : "No repairs");
   byId("repair-undo").disabled = !draft.undo;

@@ -14,7 +14,7 @@ const TITLES = { colour_by: "Colour by", label_by: "Labels", accumulated: "Accum
 // What the colours of the scene mean where they are a ramp: title and ticks.
 const BARS = {
   height: (drive) => (drive ? ["height of the scan relative to the sensor", ["−1 m", "+1 m", "+3 m"]] : ["height", ["low", "high"]]),
-  intensity: () => (state.map?.intensity === false ? ["this source has no intensity", []] : ["intensity of the returns", ["weak", "strong"]]),
+  intensity: (drive) => (!drive ? ["intensity is shown for drives only", []] : state.map?.intensity === false ? ["this source has no intensity", []] : ["intensity of the raw points", ["weak", "strong"]]),
   eccentricity: () => ["eccentricity e of a cluster", ["1 round", "10", "100 a line"]],
 };
 const counts = {};
@@ -61,6 +61,7 @@ function showBar({ colour_by: { value }, ramp }) {
   if (bar.dataset.shown === title) return;
   bar.dataset.shown = title;
   setText(bar.querySelector("figcaption"), capital(title));
+  bar.querySelector("i").hidden = !ticks.length;
   bar.querySelector("i").style.background = `linear-gradient(90deg, ${ramp.join(", ")})`;
   bar.querySelector("ol").replaceChildren(...ticks.map((text) => el("li", { text })));
 }

@@ -1,6 +1,6 @@
 // All actions of the dashboard in one table; the keys, the list of shortcuts and the palette are made from it.
 
-import { annotating, draft, redo as redoEdit, skip, toggleAdding, review, undo as undoEdit } from "../annotate/annotations.js";
+import { annotating, draft, previous, redo as redoEdit, skip, toggleAdding, review, undo as undoEdit } from "../annotate/annotations.js";
 import { byId } from "../core/dom.js";
 import { select } from "../core/live_feed.js";
 import { edits } from "../core/permissions.js";
@@ -83,6 +83,8 @@ export const ACTIONS = [
   ["Annotate: skip to the next tree to review", "s", "", inAnnotate(skip), ""],
   ["Annotate: the selected tree is a tree", "y", "", inAnnotate(() => review("tree")), ""],
   ["Annotate: the selected tree is not a tree", "n", "", inAnnotate(() => review(draft.kind)), ""],
+  ...["pole", "person", "bush", "other"].map((kind) => [`Annotate: the selected tree is of the class ${kind}`, `shift ${kind === "person" ? "h" : kind[0]}`, "", inAnnotate(() => review(kind)), ""]),
+  ["Annotate: return to the tree of the answer before", "r", "", inAnnotate(previous), ""],
   ["Annotate: delete the chosen annotation", "del", "", inAnnotate(() => document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "Delete", bubbles: true }))), "", "remove erase"],
   ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: redo your last edit", "", "", inAnnotate(redoEdit)],
   ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],

@@ -16,6 +16,7 @@ const WORDS = {
 const NO_FIGURES = ["starting", "failed"];
 const TESTED = ["good", "weak", "lost"]; // the pose was tested by trees; else its sigma says nothing
 const OLD_AFTER = 3000; // [ms] without a message while a run plays
+const LEFT_OUT = 0.1; // share of the scans above which the map is doubtful, as in app/batch/summary.py
 const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans take longer
 
 // title, unit, function of the status that returns [text, class, title, unit], all but the text may be left out; in the order in
@@ -26,7 +27,7 @@ const FIGURES = {
   health: ["SLAM", "", (s) => health(s)],
   f1: ["F1 of the map", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 || s.scans_left_out ? "warn" : "", s.scans_left_out ? `behind, ${s.scans_left_out} left out` : "scans behind"]],
+  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 || s.scans_left_out > LEFT_OUT * (s.scans_left_out + s.scan_index + 1) ? "warn" : "", s.scans_left_out ? `behind, ${s.scans_left_out} left out` : "scans behind"]],
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`]],
   rate: ["scans mapped", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE]],
   sigma: ["pose sigma", "", (s) => (state.map && TESTED.includes(s.health) ? sigma(state.map.sigma_xy) : [NONE])],
@@ -112,10 +113,10 @@ function show() {
   cells.health.cell.title = healthFigures();
   cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has the times of the run.";
   cells.rate.cell.title = "Scans that were mapped in a second, over the last 20 of them";
-  cells.behind.cell.title = "Scans that wait to be mapped. Scans that were lost or skipped are left out of the map; Scores lists why";
+  cells.behind.cell.title = "Scans that wait to be mapped. Scans that were lost or skipped are left out of the map";
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
-  cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
+  cells.f1.cell.hidden = (!state.evaluation && !state.truth) || NO_FIGURES.includes(status.state); // a run with ground truth keeps its cell
   const title = titleOf(status.source, show);
   showName(title || NONE);
   byId("source-button").title = `${status.source} (${status.kind}). Open another run`;
@@ -151,7 +152,7 @@ function showState() {
   }
   box.classList.toggle("going", state.connected && isGoing(state.status));
   setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.refused ? "No access" : state.lostAt ? "No connection" : "Connecting");
-  box.title = robotsTitle(state.status);
+  box.title = [box.querySelector("b").textContent, robotsTitle(state.status)].filter(Boolean).join("\n"); // a long name is cut
   showRecording(state.status?.recording ?? "");
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
   const quiet = isOld();
@@ -256,7 +257,7 @@ const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 export function startStatus() {
   byId("recording").addEventListener("click", endRecording);
   build();
-  on("status map evaluation annotations", show);
+  on("status map evaluation annotations truth", show);
   on("status map", showWay);
   on("status connection", showState);
   setInterval(showState, 1000);

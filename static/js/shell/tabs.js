@@ -49,8 +49,10 @@ export function startDrawer() {
   const show = (open) => {
     side.classList.toggle("open", open);
     button.setAttribute("aria-expanded", String(open));
-    remember("drawer", open ? "open" : "closed");
   };
   show(recall("drawer") !== "closed");
-  button.addEventListener("click", () => show(!side.classList.contains("open")));
+  button.addEventListener("click", () => {
+    show(!side.classList.contains("open"));
+    remember("drawer", side.classList.contains("open") ? "open" : "closed");
+  });
 }

@@ -116,7 +116,7 @@ def test_trees_that_are_not_confirmed_are_not_shown(scene: Scene):
 
 def test_points_are_coloured_by_intensity_where_the_source_has_it(scene: Scene):
     frame = make_frame(2, clusters=5)
-    bright = np.linspace(0.0, 90.0, len(frame.raw), dtype=np.float32)
+    bright = np.linspace(0.0, 255.0, len(frame.raw)).astype(np.uint8)
     scene.choose("colour_by", "intensity")
     scene.show(frame, PATH[:3], bright)
     found = node(scene, "/world/robot/scan/raw").colors.astype(int)

@@ -19,7 +19,7 @@ from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Pose3
-from pipeline.preprocessing import acquire
+from pipeline.preprocessing import acquire, acquired_rows
 from pipeline.repairs.record import Repair
 from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer
 from pipeline.types.records import Frame, Scan, Step
@@ -508,10 +508,12 @@ def test_reflectances_are_those_of_the_acquired_points() -> None:
     bright = np.arange(500, dtype=np.float32)
     step = Step(0, Scan(1, points, bright), None)
     raw, _ = acquire(step, Pose3.identity(), acquisition)
+    np.testing.assert_array_equal(points[acquired_rows(step, acquisition)], raw)
+    assert 2 < len(raw) < 500
     found = reflectance_of(raw, step, acquisition)
     assert found is not None
-    assert 2 < len(found) < 500
-    np.testing.assert_array_equal(points[found.astype(int)], raw)
+    assert (found[0], found[-1], len(found)) == (0, 255, len(raw))
+    assert (np.diff(found.astype(int)) >= 0).all()
     assert reflectance_of(raw[:0], step, acquisition) is None
     assert reflectance_of(raw, Step(0, Scan(1, points), None), acquisition) is None
 

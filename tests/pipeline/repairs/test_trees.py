@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SourceError
-from pipeline.repairs.record import Kind, Repair, parse_repairs, read_repairs, repairs_text, unapplied
+from pipeline.repairs.record import (
+    Kind,
+    Repair,
+    identity_of,
+    parse_repairs,
+    read_repairs,
+    repairs_text,
+    tied_numbers,
+    unapplied,
+)
 from pipeline.repairs.trees import FIRST_ADDED, repaired_trees
-from pipeline.types.records import Trees
+from pipeline.types.records import Path, Trees
 from tests.pipeline.strategies import trees
 
 THREE = trees([[0.0, 0.0], [5.0, 0.0], [9.0, 1.0]])
@@ -83,6 +92,18 @@ def test_a_file_of_repairs_is_read_as_it_was_written(tmp_path):
     assert parse_repairs(repairs_text(()), "file") == ()
     with pytest.raises(SourceError, match="cannot be read"):
         read_repairs(tmp_path / "none.json")
+
+
+def test_equal_repairs_in_the_same_order_have_one_identity():
+    a, b = Repair("delete", ((1.0, 2.0),)), Repair("delete", ((1.0, 3.0),))
+    assert identity_of(parse_repairs(repairs_text((a, b)), "file")) == identity_of((a, b))
+    assert len({identity_of(each) for each in ((a, b), (b, a), (a,), ())}) == 4
+
+
+def test_a_tie_names_only_trees_that_were_seen_in_scans_of_the_map():
+    path = Path(np.array([10, 20]), *(np.zeros(2) for _ in range(4)))
+    ties = [Repair("tie", ((0.0, 0.0), (5.0, 0.0)), stamps) for stamps in ((10, 20), (9, 20), (10, 21))]
+    assert [tied_numbers(THREE, path, tie) for tie in ties] == [(1, 2), (2,), (1,)]
 
 
 @pytest.mark.parametrize(
