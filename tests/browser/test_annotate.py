@@ -229,7 +229,7 @@ def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard)
     history, title = page.locator("#review-history"), page.locator("#review-title")
     expect(history).to_be_hidden()
     canvas.press("s")
-    for key, number in zip("yPH", (first, second, third), strict=True):
+    for key, number in zip(("y", "Shift+P", "Shift+H"), (first, second, third), strict=True):
         expect(title).to_have_text(f"Tree {number}")
         person.answer(key)
     expect(history.get_by_role("button")).to_have_text(
@@ -244,10 +244,15 @@ def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard)
     page.locator("#review-story").click()
     expect(page.locator("#panel-story [data-rejected=pole]")).to_contain_text("rejected this tree")
     person.tab("Annotate")
-    person.answer("B")
+    canvas.press("b")  # the view from behind is no answer
+    person.answer("Shift+B")
     expect(history.get_by_role("button").nth(1)).to_have_text(f"{second} bush")
     history.get_by_role("button", name=f"{first} tree").click()
     expect(title).to_have_text(f"Tree {first}")
+    canvas.press("Control+z")
+    expect(history.get_by_role("button").nth(1)).to_have_text(f"{second} pole")
+    canvas.press("Control+z")  # the answer before, which makes its tree open again
+    expect(history.get_by_role("button")).to_have_text(["Previous (R)", f"{second} pole", f"{first} tree"])
     assert person.errors == []
 
 

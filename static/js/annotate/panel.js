@@ -229,11 +229,11 @@ function keyOfChosen(event) {
   return true;
 }
 
-function keyOfTab({ key }) {
+function keyOfTab({ key, shiftKey }) {
   if (key === "a") toggleAdding();
   else if (key === "y") review("tree");
   else if (key === "n") review(draft.kind);
-  else if (key in CLASS_KEYS) review(CLASS_KEYS[key]);
+  else if (shiftKey && key in CLASS_KEYS) review(CLASS_KEYS[key]);
   else if (key === "s") skip();
   else if (key === "r") previous();
   else if (key === "Escape" && draft.adding) toggleAdding(false);
