@@ -147,6 +147,7 @@ def nothing_that_changes_is_offered(viewer: Dashboard) -> None:
         panel = viewer.tab(name)
         expect(panel.locator("> *").first).to_be_attached()
         assert panel.locator("> *").evaluate_all("nodes => nodes.every(node => node.inert)")
+    expect(page.locator("#annotate-ask")).to_be_hidden()  # which could not be dismissed
     map_.press("n")
     expect(page.locator("#trees-export option[value=laz]")).to_have_css("display", "none")
     viewer.tab("Clusters").locator("#cluster-table tbody tr").first.click()

@@ -142,8 +142,8 @@ async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
 @router.get("/annotations.csv")
 async def export_table(dashboard: Dash) -> Response:
     """Return the annotations as a CSV table for the import and for `stemmap evaluate`, those of a run of one
-    step in the coordinates of its file; `tree` is the number of the tree of the map that each is about. Only
-    the header without annotations."""
+    step in the coordinates of its file; `tree` is the number of the tree that each is about in the map of the
+    shown scan. Only the header without annotations."""
     from pipeline.io.result_files import csv_text
 
     return text_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
@@ -153,7 +153,7 @@ async def export_table(dashboard: Dash) -> Response:
 async def export_geojson(dashboard: Dash) -> Response:
     """Return the annotations as a FeatureCollection of points in the frame of the map, or of the file of a
     run of one step, which it declares, with class, DBH [cm], author, time and number of the tree in
-    the map; no features without annotations."""
+    the map of the shown scan; no features without annotations."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
     frame = dict(ROBOTS_FRAME)
@@ -170,8 +170,8 @@ async def export_geojson(dashboard: Dash) -> Response:
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     """Return the annotations of objects of the open run as dicts, see `row_payload`, with `tree`, the number
-    of the nearest tree of the map within half a metre, None for none; for a run of one step, in the
-    coordinates of its file."""
+    of the nearest tree within half a metre in the map of the shown scan, None for none; for a run of one
+    step, in the coordinates of its file."""
     x, y = dashboard.offset
     rows = [row_payload(row) for row in dashboard.annotation_editor.rows]
     return [

@@ -59,8 +59,8 @@ function build() {
     el("div", { class: "annotate-files" },
       el("label", {}, "Name ", nameField("annotate-name")),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,
-      el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "Save CSV", title: "Download the annotations as CSV" }),
-      el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "Save GeoJSON", title: "Download the annotations as GeoJSON" })),
+      el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "Save CSV", title: "Download the annotations as CSV, with the tree numbers of the shown scan" }),
+      el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "Save GeoJSON", title: "Download the annotations as GeoJSON, with the tree numbers of the shown scan" })),
     ...ofExtensions("annotateSections"));
 }
 
