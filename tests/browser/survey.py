@@ -102,7 +102,7 @@ def survey_run(browser: Browser, link: str, folder: Path, size: str, wanted: lis
     page.wait_for_timeout(CLICK_MS)
     survey.picture("page")
     page.locator("#map").press("Escape")  # the selection of the size before, which the server keeps
-    if page.locator("#drawer-button").is_visible():
+    if not page.locator("#side").is_visible():
         page.locator("#drawer-button").click()
     page.locator("#trees tbody tr").nth(4).click()
     page.locator("#panel-story[data-story^=tree]").wait_for()
