@@ -15,8 +15,8 @@ _NEAREST, _FARTHEST = 0.5, 5.0
 #: Points of a part repeat within twice the range error of a coarse LiDAR [m].
 _SAME = 0.06
 #: Scans are from different places if less than this share of the points farther away, and higher than _ABOVE
-#: [m], repeats within _NEAR [m].
-_ELSEWHERE, _ABOVE, _NEAR = 0.3, 0.5, 0.1
+#: [m], repeats within _NEAR [m], the size of a trunk: a side of it along the motion repeats over less.
+_ELSEWHERE, _ABOVE, _NEAR = 0.3, 0.5, 0.5
 #: Fewest places, fewest points of a part, and of those of them in a column, of which a post may be in four;
 #: its least height, and side of the columns [m].
 _PLACES, _POINTS, _PART, _HEIGHT, _COLUMN = 4, 20, 6, 0.4, 0.5
