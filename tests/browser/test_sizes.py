@@ -102,7 +102,7 @@ def test_the_strip_of_a_live_run_is_whole_and_nothing_in_it_moves(mapped: Dashbo
     for width, height in ((1440, 900), (1280, 720), (1024, 768), (820, 1180), (390, 844)):
         page.set_viewport_size({"width": width, "height": height})
         mapped.drawn()
-        places = []
+        places, words = [], []
         for busy in (False, True):
             seen = page.evaluate(SEEN.format(LIVE, STRIP, SPILLS, OVERLAPS, WORDS), busy)
             (place, cut), spills, overlaps, words = seen
