@@ -408,25 +408,26 @@ class WorkerLoop:
     def _show(self, frame: Frame | None) -> None:
         """Queue the frame of the session with its repairs, the path and the confirmation times; nothing for
         None."""
-        session, path, repaired = self._session, self._session.shown.path, self._session.shown.repaired
-        frame = None if frame is None else session.shown.frame
+        shown, run = self._session.shown, self._session.run
+        path, repaired = shown.path, shown.repaired
+        frame = None if frame is None else shown.frame
         if frame is not None and path is not None:
             self._put(
                 protocol.Shown(
                     run=self._run,
-                    time_s=session.shown.time_s,
+                    time_s=shown.time_s,
                     frame=frame,
                     path_start=0,
                     path=path,
-                    confirmed_s=session.shown.confirmed_s,
-                    counts=session.shown.counts,
-                    odometry_xy=session.shown.odometry_xy[: len(path.x)],
+                    confirmed_s=shown.confirmed_s,
+                    counts=shown.counts,
+                    odometry_xy=shown.odometry_xy[: len(path.x)],
                     problems=() if repaired is None else repaired.problems,
-                    loops=session.shown.loops,
-                    repairs=() if repaired is None else session.shown.repairs,
+                    loops=shown.loops,
+                    repairs=() if repaired is None else shown.repairs,
                     repaired_numbers=() if repaired is None else repaired.numbers,
-                    reflectance=session.shown.reflectance,
-                    has_intensity=None if session.run is None else session.run.has_intensity,
+                    reflectance=shown.reflectance,
+                    has_intensity=None if run is None else run.has_intensity,
                 )
             )
 

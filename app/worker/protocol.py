@@ -24,7 +24,7 @@ from pipeline.repairs.record import Repair
 from pipeline.types.camera import Camera, Picture
 from pipeline.types.records import Float, Frame, Int, Path, Trees, TruthTrees
 
-Bytes = NDArray[np.uint8]
+UInt8 = NDArray[np.uint8]
 
 # Beyond any run, and well inside of an int64 of nanoseconds.
 LONGEST_S = 1e9
@@ -270,7 +270,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     loops: Int = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
     repairs: tuple[Repair, ...] = ()
     repaired_numbers: tuple[tuple[int, ...], ...] = ()
-    reflectance: Bytes | None = None
+    reflectance: UInt8 | None = None
     has_intensity: bool | None = None
 
 

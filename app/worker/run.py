@@ -19,7 +19,7 @@ from app.robot.source import LiveSource
 from app.sources.request import SourceRequest, with_odometry
 from app.worker.course import QUANTITIES, STAGE, stage_times
 from app.worker.cursor import Cursor, StepStore, live_steps
-from app.worker.protocol import Bytes, RunCounts, RunCourse, Shown
+from app.worker.protocol import RunCounts, RunCourse, Shown, UInt8
 from app.worker.remap import (
     NOT_OF_THE_MAP,
     Remapping,
@@ -134,7 +134,7 @@ class Run:
         return self._map.counts.totals(index, self.warnings, self.losses)
 
     @property
-    def reflectance(self) -> Bytes | None:
+    def reflectance(self) -> UInt8 | None:
         """Reflectance of the raw points of the current scan, see `reflectance_of`."""
         if self.frame is None or self._step is None:
             return None
@@ -575,7 +575,7 @@ def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Para
     return tuple(sets)
 
 
-def reflectance_of(raw: Float32, step: Step, parameters: Acquisition) -> Bytes | None:
+def reflectance_of(raw: Float32, step: Step, parameters: Acquisition) -> UInt8 | None:
     """Return the reflectance of the raw points of a frame, uint8, shape (N,): 0 and 255 are the percentiles 1
     and 99 of the scan. None if the scan has none, and for a frame without points."""
     if step.scan.reflectance is None or not len(raw):
@@ -587,5 +587,5 @@ def reflectance_of(raw: Float32, step: Step, parameters: Acquisition) -> Bytes |
     sample = np.nan_to_num(found[evenly_spaced(len(found), 2000)], posinf=0.0, neginf=0.0)
     low, high = np.percentile(sample, (1.0, 99.0)).tolist()
     within = np.fmin(np.fmax(found, low), high)  # NaN is low
-    shades: Bytes = ((within - low) * (255.0 / max(high - low, 1e-9))).astype(np.uint8)
+    shades: UInt8 = ((within - low) * (255.0 / max(high - low, 1e-9))).astype(np.uint8)
     return shades

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from app.worker.one_step_run import OneStepRun
-from app.worker.protocol import Bytes, RunCounts, Shown
+from app.worker.protocol import RunCounts, Shown, UInt8
 from app.worker.run import Run
 from pipeline.config import Parameters
 from pipeline.repairs.record import Repair
@@ -44,13 +44,15 @@ class ShownMap:
         self._faults: dict[str, None] = {}  # of the repairs, that were printed
 
     @property
+    def _unrepaired(self) -> Shown | AnyRun | None:
+        """The map of the sought scan if it was mapped, else of the current scan, before the repairs."""
+        return self._kept or self.run
+
+    @property
     def frame(self) -> Frame | None:
         """Frame of the current scan, or of the sought scan if it was mapped, with the repairs; None if there
         is no run, or before its first scan."""
-        repaired = self.repaired
-        if repaired is not None:
-            return repaired.frame
-        shown = self._kept or self.run
+        shown = self.repaired or self._unrepaired
         return shown.frame if shown else None
 
     @property
@@ -58,15 +60,14 @@ class ShownMap:
         """The map with the repairs; None without repairs, and without a map. While the run plays or a scan is
         sought, loops are repaired by an earlier solution. If the repairs fail, the map is without them, and
         the error is the problem of each."""
-        shown, run = self._kept or self.run, self.run
+        shown, run = self._unrepaired, self.run
         if not self.repairs or shown is None or shown.frame is None or run is None:
             return None
         hurried = self.is_hurried
         if self._repaired is not None and self._repaired[0] is shown.frame and self._repaired[1] <= hurried:
             return self._repaired[2]
-        of_drive = isinstance(run, Run) and self._kept is None
         graph, landmarks = KeyframeGraph(), np.full(len(shown.frame.trees.number), -1)
-        if isinstance(run, Run) and of_drive:
+        if isinstance(run, Run) and self._kept is None:
             graph, landmarks = run.graph, run.tree_landmarks
         of_run = MapOfRun(shown.frame, shown.path, graph, landmarks)
         try:
@@ -83,9 +84,9 @@ class ShownMap:
         return found
 
     @property
-    def reflectance(self) -> Bytes | None:
+    def reflectance(self) -> UInt8 | None:
         """Reflectance of the raw points of `frame`, see `reflectance_of`; None where it is unknown."""
-        shown = self._kept or self.run
+        shown = self._unrepaired
         return None if shown is None else shown.reflectance
 
     @property
@@ -124,7 +125,7 @@ class ShownMap:
     def mapped_place(self, number: int) -> Float | None:
         """Return the position of a tree in the map before the repairs, shape (2,) [m]; None if that map has
         no tree of this number."""
-        shown = self._kept or self.run
+        shown = self._unrepaired
         if shown is None or shown.frame is None:
             return None
         rows = np.flatnonzero(shown.frame.trees.number == number)
@@ -133,10 +134,7 @@ class ShownMap:
     @property
     def path(self) -> Path | None:
         """Path up to the scan of `frame`, without rows before its first scan; None if there is no run."""
-        repaired = self.repaired
-        if repaired is not None:
-            return repaired.path
-        shown = self._kept or self.run
+        shown = self.repaired or self._unrepaired
         return shown.path if shown else None
 
     @property
@@ -149,7 +147,7 @@ class ShownMap:
     def confirmed_s(self) -> Float | None:
         """Confirmation time of each tree of `frame`, shape (T,) [s since the first scan], NaN for trees that
         never were confirmed; None if there is no frame."""
-        shown, frame = self._kept or self.run, self.frame
+        shown, frame = self._unrepaired, self.frame
         known = shown.confirmed_s if shown else None
         if shown is None or known is None or shown.frame is None or frame is None or frame is shown.frame:
             return known
@@ -201,5 +199,5 @@ class ShownMap:
         self.forget_repaired()
 
     def forget_repaired(self) -> None:
-        """Repair the map anew, because the run has another one."""
+        """Forget the solution of the repairs; call it when the run has another map."""
         self._repairer, self._repaired = Repairer(), None

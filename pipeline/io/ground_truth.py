@@ -176,7 +176,7 @@ class _Sensor(msgspec.Struct, frozen=True):
     range_max: Annotated[float, msgspec.Meta(gt=0, le=10_000)] = _UNKNOWN.range_max
 
 
-class _Trees(msgspec.Struct, frozen=True):
+class _TreeColumns(msgspec.Struct, frozen=True):
     x: Rows
     y: Rows
     dbh: Annotated[list[float | None], msgspec.Meta(max_length=2_000_000)]
@@ -197,7 +197,7 @@ class _Path(msgspec.Struct, frozen=True):
 class _TruthFile(msgspec.Struct, frozen=True):
     version: Literal[1]
     sensor: _Sensor | None = None
-    trees: _Trees | None = None
+    trees: _TreeColumns | None = None
     path: _Path | None = None
 
 
@@ -226,7 +226,7 @@ def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
     return Truth(trees, path), sensor
 
 
-def _trees(columns: _Trees) -> TruthTrees:
+def _trees(columns: _TreeColumns) -> TruthTrees:
     """Return columns of a file as trees; unknown diameters become NaN."""
     dbh = [np.nan if diameter is None else diameter for diameter in columns.dbh]
     return TruthTrees(np.array(columns.x), np.array(columns.y), np.array(dbh, float), tuple(columns.kind))

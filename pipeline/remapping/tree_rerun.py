@@ -126,7 +126,7 @@ class TreeRerun:
         self.mapper, self.by_scan = mapper, TreesByScan()
         self._log, self._replay = log, TreeReplay(mapper.tracker, mapper.parameters)
         self._stamps, self._motion, self._path = array("q"), array("d"), array("d")
-        self._kept: dict[int, _Trees] = {}  # of the states that are kept for a lost robot, by their scans
+        self._kept: dict[int, _TreeState] = {}  # of the states that are kept for a lost robot, by their scans
 
     @property
     def done(self) -> int:
@@ -189,13 +189,13 @@ class TreeRerun:
         if not all(map(are_same, found, known.found)):
             raise TreesDifferError
 
-    def _trees(self) -> _Trees:
+    def _trees(self) -> _TreeState:
         """Return a copy of the present trees."""
         tracker = self._replay.tracker
-        return _Trees(tracker.tracks.copy(), tracker.next_number, self._replay.verdict)
+        return _TreeState(tracker.tracks.copy(), tracker.next_number, self._replay.verdict)
 
 
-class _Trees(NamedTuple):
+class _TreeState(NamedTuple):
     """Tracks, number of the next new tree, and verdicts of the columns between two scans."""
 
     tracks: TrackTable
@@ -203,14 +203,14 @@ class _Trees(NamedTuple):
     verdict: Int32
 
 
-def _with_all_trees(trees: _Trees, kept: Mapping[int, _Trees], state: MapperState) -> MapperState:
+def _with_all_trees(trees: _TreeState, kept: Mapping[int, _TreeState], state: MapperState) -> MapperState:
     """Return a state with other trees, and with those in `kept` in the states that it keeps, by their
     scans."""
     states = tuple((index, _with_trees(each, kept[index])) for index, each in state.recovery.kept)
     return replace(_with_trees(state, trees), recovery=replace(state.recovery, kept=states))
 
 
-def _with_trees(state: MapperState, trees: _Trees) -> MapperState:
+def _with_trees(state: MapperState, trees: _TreeState) -> MapperState:
     """Return a state with other trees; the arrays are shared."""
     gathering = state.gathering
     columns = replace(gathering.columns, verdict=trees.verdict)

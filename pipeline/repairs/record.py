@@ -175,14 +175,21 @@ def seen_from(trees: Trees, path: Path, place: tuple[float, float]) -> tuple[int
 def tied_numbers(trees: Trees, path: Path, repair: Repair) -> tuple[int, ...]:
     """Return the numbers of the trees of a map that a "tie" makes one; those not in the map, and those seen
     when it has no scan, are left out."""
-    rows = list[int | None]()
+    places = list[tuple[float, float]]()
     for stamp, place in zip(repair.stamps_ns, repair.places, strict=False):  # "forbid" has no places
         if not len(path.x) or not path.stamp_ns[0] <= stamp <= path.stamp_ns[-1]:
             continue
         scan = int(np.searchsorted(path.stamp_ns, stamp))
         pose = Pose2(float(path.x[scan]), float(path.y[scan]), float(path.yaw[scan]))
         x, y = pose.apply(np.array(place)).tolist()
-        rows.append(nearest_tree(trees, (x, y), confirmed=True))
+        places.append((x, y))
+    return numbers_at(trees, places, confirmed=True)
+
+
+def numbers_at(trees: Trees, places: Sequence[tuple[float, float]], *, confirmed: bool) -> tuple[int, ...]:
+    """Return the number of the tree at each position, see `nearest_tree`; positions without one are left
+    out."""
+    rows = [nearest_tree(trees, place, confirmed=confirmed) for place in places]
     return tuple(int(trees.number[row]) for row in rows if row is not None)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.geometry.columns import rows_of
-from pipeline.repairs.record import GATE, Repair, nearest_tree
+from pipeline.repairs.record import GATE, Repair, nearest_tree, numbers_at
 from pipeline.types.records import Float, Int, Trees
 
 #: Numbers of trees that a repair adds begin here; no map of scans has so many trees.
@@ -57,8 +57,7 @@ def repaired_trees(trees: Trees, repair: Repair, added: int) -> tuple[Trees, str
 def numbers_of(trees: Trees, repair: Repair) -> tuple[int, ...]:
     """Return the numbers of the trees that a repair of trees is about; those not in the map are left out."""
     places = repair.places if repair.kind == "merge" else repair.places[:1]
-    rows = [nearest_tree(trees, place, confirmed=repair.value != "tree") for place in places]
-    return tuple(int(trees.number[row]) for row in rows if row is not None)
+    return numbers_at(trees, places, confirmed=repair.value != "tree")
 
 
 def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:

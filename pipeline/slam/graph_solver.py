@@ -163,7 +163,7 @@ class Problem:
             if (step := self._step(normal, damping)) is not None:
                 moved, placed = x + step[0], l + step[1]
                 new_cost, new_normal = self._linearised(moved, placed, quadratic_loops)
-            if new_cost > cost * (1.0 + 1e-9):
+            if not new_cost <= cost * (1.0 + 1e-9):  # a NaN is no decrease
                 damping *= DAMPING_FACTOR
                 if damping > DAMPING_MAX:
                     return None

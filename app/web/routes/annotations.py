@@ -19,7 +19,7 @@ from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
 from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
 from pipeline.errors import SourceError
-from pipeline.repairs.record import nearest_tree
+from pipeline.repairs.record import numbers_at
 
 router = APIRouter(prefix="/api")
 
@@ -27,7 +27,7 @@ _LARGEST_DBH_M = 10.0
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
 
 
-class _Add(Edit):
+class _AddAnnotation(Edit):
     x: Metres
     y: Metres
     kind: Literal["tree", "pole", "person", "bush", "other", "skipped"] = "tree"
@@ -39,7 +39,7 @@ class _Add(Edit):
         return Content(self.x, self.y, self.kind, None if self.dbh_cm is None else self.dbh_cm / 100.0)
 
 
-class _AnnotationChange(_Add):
+class _AnnotationChange(_AddAnnotation):
     version: Number
 
 
@@ -47,7 +47,7 @@ class _Delete(Edit):
     version: Number
 
 
-class _Import(Edit):
+class _ImportTable(Edit):
     """A table of trees as text; `dbh_unit` is the unit of a column `dbh` whose header does not name it."""
 
     table: Annotated[str, Field(max_length=1_000_000)]
@@ -72,7 +72,7 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 
 
 @router.post("/annotations")
-async def add(body: _Add, dashboard: Dash) -> Response:
+async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
     """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
     and not exported); return its number (`id`) and the counts of edits, see `edited`, with 201. 409 if
     another run was opened meanwhile, nothing can be annotated, or the run has MOST_ANNOTATIONS."""
@@ -113,7 +113,7 @@ async def redo(body: Edit, dashboard: Dash) -> Response:
 
 
 @router.post("/annotations/import")
-async def import_table(body: _Import, dashboard: Dash) -> Response:
+async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     """Add the rows of a CSV table in one edit. Return the number of added rows (`added`), the number of rows
     that exist already as annotations or earlier in the table (`left_out`), and the counts of edits, see
     `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows, 409 as in `add`; then
@@ -184,9 +184,7 @@ def _tree_at(dashboard: Dashboard, x: float, y: float) -> int | None:
     """Return the number of the tree of the map that an annotation at x, y [m] is about, None for none."""
     if dashboard.shown is None:
         return None
-    trees = dashboard.shown.frame.trees
-    row = nearest_tree(trees, (x, y), confirmed=True)
-    return None if row is None else int(trees.number[row])
+    return next(iter(numbers_at(dashboard.shown.frame.trees, [(x, y)], confirmed=True)), None)
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
@@ -233,7 +231,7 @@ def _check(content: Content, row: int) -> None:
 
 
 def _imported(
-    body: _Import, offset: tuple[float, float], unit: tuple[float, float] = (1.0, 1.0)
+    body: _ImportTable, offset: tuple[float, float], unit: tuple[float, float] = (1.0, 1.0)
 ) -> list[Content]:
     """Return the rows of an imported table in the frame of the map; raises BadRequestError if it cannot be
     read, or a row or their number is out of bounds. A table of a file in feet may be in feet or in metres,

@@ -25,7 +25,7 @@ router = APIRouter(prefix="/api")
 _Place = Annotated[list[Metres], Field(min_length=2, max_length=2)]
 
 
-class _Add(Edit):
+class _AddRepair(Edit):
     """A repair: positions of trees in the map; of "forbid", the scans of both ends of the loop; the class."""
 
     kind: Kind
@@ -34,14 +34,14 @@ class _Add(Edit):
     value: Literal["", "tree", "pole", "person", "bush", "other"] = ""
 
 
-class _Import(Edit):
+class _ImportRepairs(Edit):
     """Text of a file of repairs."""
 
     text: Annotated[str, Field(max_length=1_000_000)]
 
 
 @router.post("/repairs")
-async def add(body: _Add, dashboard: Dash) -> Response:
+async def add(body: _AddRepair, dashboard: Dash) -> Response:
     """Add a repair; return its number (`id`) and the counts of edits, see `edited`, with 201. 409 before the
     first map or if another run was opened meanwhile, 422 for a repair that is not valid, and for a tie of a
     position without a tree."""
@@ -52,7 +52,7 @@ async def add(body: _Add, dashboard: Dash) -> Response:
 
 
 @router.post("/repairs/import")
-async def import_file(body: _Import, dashboard: Dash) -> Response:
+async def import_file(body: _ImportRepairs, dashboard: Dash) -> Response:
     """Add the repairs of a file in one edit, without those that the run has already; return their number
     (`added`) and the counts of edits, see `edited`. 422 if the text is no file of repairs."""
     with as_bad_request("the file"):
@@ -71,7 +71,7 @@ async def save(dashboard: Dash) -> Response:
     return text_reply(repairs_text(dashboard.annotation_editor.repairs), "repairs.json", "application/json")
 
 
-def _repair(body: _Add, dashboard: Dashboard) -> Repair:
+def _repair(body: _AddRepair, dashboard: Dashboard) -> Repair:
     """Return the repair of a request. A tie gets the times at which its trees were seen and their positions
     in the frames of the robot, so that it holds where the path is another one.
 

@@ -80,7 +80,7 @@ def reach_of_body(scans: Sequence[Float]) -> float:
     np.minimum.at(low, column, body[:, 2])
     np.maximum.at(high, column, body[:, 2])
     body = body[((high - low)[column] > _HEIGHT) & (count[column] >= _PART)]
-    sectors = np.unique((np.arctan2(body[:, 1], body[:, 0]) / (2.0 * np.pi) * _SECTORS).astype(np.int64))
+    sectors = np.unique(np.floor(np.arctan2(body[:, 1], body[:, 0]) / (2.0 * np.pi) * _SECTORS))
     if len(body) < _POINTS or len(sectors) > _SECTORS // 2:
         return 0.0
     return float(np.linalg.norm(body, axis=1).max()) + _SAME

@@ -81,20 +81,22 @@ def check_tilt(
         is_recorded: Whether the mounting is that of fixed transforms.
     """
     numbers = messages.odometry.topics.numbers("imu")
-    trunks, leaning, grounds = list[Float](), list[Float](), list[Float]()
-    for log_ns, points in scans:
-        if (up := _up_of(points)) is None:
+    levelling = [_levelling_near(messages, decoder, numbers, log_ns) for log_ns, _ in scans]
+    has_imu = any(R is not None for R in levelling)
+    unlevelled, trunks, grounds = list[Float](), list[Float](), list[Float]()
+    for (_, points), R_level_base in zip(scans, levelling, strict=True):
+        if (R_level_base is None and has_imu) or (up := _up_of(points)) is None:
             continue
-        R_level_base = _levelling_near(messages, decoder, numbers, log_ns)
-        trunks.append(up)
-        if R_level_base is not None:
-            leaning.append(R_level_base @ up)
+        R = np.eye(3) if R_level_base is None else R_level_base
+        unlevelled.append(up)
+        trunks.append(R @ up)
         if (ground := _ground_of(points, up)) is not None:
-            grounds.append(ground if R_level_base is None else R_level_base @ ground)
-    lean = _common_tilt(leaning)
-    imu = messages.odometry.topics.chosen["imu"].name if leaning else ""
-    upright = np.mean(trunks, axis=0) if trunks else np.zeros(3)
-    if lean and upright[2] > np.cos(_UPRIGHT) * np.linalg.norm(upright):
+            grounds.append(R @ ground)
+    lean, tilt = _common_tilt(trunks), _common_tilt(grounds)
+    if not lean:
+        return TiltCheck()
+    imu = messages.odometry.topics.chosen["imu"].name if has_imu else ""
+    if has_imu and _mean_of(unlevelled)[2] > np.cos(_UPRIGHT):
         return TiltCheck(
             uses_imu=False,
             warnings=(
@@ -102,11 +104,7 @@ def check_tilt(
                 "they do not without it: the orientation is not used",
             ),
         )
-    stems = leaning if leaning else trunks
-    tilt = _common_tilt(grounds)
-    if not (is_recorded or leaning) or not tilt or not _common_tilt(stems):
-        return TiltCheck()
-    if np.mean(grounds, axis=0) @ np.mean(stems, axis=0) < np.cos(_ALIKE):
+    if not (is_recorded or has_imu) or not tilt or _mean_of(grounds) @ _mean_of(trunks) < np.cos(_ALIKE):
         return TiltCheck()
     wrong = f"the orientation in {imu} or the fixed transforms are" if imu else "the fixed transform is"
     return TiltCheck(
@@ -182,8 +180,13 @@ def _common_tilt(ups: list[Float]) -> float:
     the vectors are fewer than _FEWEST, or one of them is farther than _ALIKE from the mean."""
     if len(ups) < _FEWEST:
         return 0.0
-    mean = np.mean(ups, axis=0)
-    mean /= max(float(np.linalg.norm(mean)), 1e-9)
+    mean = _mean_of(ups)
     tilt = float(np.arccos(np.clip(mean[2], -1.0, 1.0)))
     is_alike = bool((np.array(ups) @ mean > np.cos(_ALIKE)).all())
     return tilt if tilt >= _TILTED and is_alike else 0.0
+
+
+def _mean_of(ups: list[Float]) -> Float:
+    """Return the mean of unit vectors, of length 1, shape (3,)."""
+    mean: Float = np.mean(ups, axis=0)
+    return mean / max(float(np.linalg.norm(mean)), 1e-9)

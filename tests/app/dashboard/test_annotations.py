@@ -23,7 +23,7 @@ from app.dashboard.dashboard import Dashboard
 from app.store.async_store import LARGEST_QUEUE, AsyncStore, StoreBusyError
 from app.store.records import Annotation, Content, contents_of
 from app.web.auth import session_value
-from app.web.routes.annotations import _Import, _imported
+from app.web.routes.annotations import _imported, _ImportTable
 from app.worker.protocol import Shown
 from pipeline.io.ground_truth import parse_truth_trees
 from pipeline.types.records import TruthTrees
@@ -239,7 +239,7 @@ async def test_a_saved_table_names_the_trees_of_the_map() -> None:
 def test_a_table_for_a_cloud_in_feet_may_be_in_feet_or_metres(metres: float) -> None:
     foot = 0.3048
     x, y = 2_491_010.0 * foot / metres, 6_973_020.0 * foot / metres
-    body = _Import.model_validate({"run": 1, **ANN, "table": f"x,y,dbh_cm\n{x},{y},31\n"})
+    body = _ImportTable.model_validate({"run": 1, **ANN, "table": f"x,y,dbh_cm\n{x},{y},31\n"})
     [content] = _imported(body, (2_491_000.0 * foot, 6_973_000.0 * foot), (foot, foot))
     assert (content.x, content.y) == pytest.approx((10.0 * foot, 20.0 * foot), abs=1e-6)
     assert content.dbh == pytest.approx(0.31)

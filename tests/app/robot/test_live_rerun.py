@@ -22,7 +22,7 @@ from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.types.records import Frame
 from tests.app.robot.conftest import until
 from tests.app.robot.test_live_session import URI, FakeLink, announce
-from tests.app.worker.test_remap import BASE, FEWER, JUDGED, LATER, told
+from tests.app.worker.test_remap import BASE, FEWER, JUDGED, LATER, content_of
 
 SCANS, ASKED = 40, 18  # no more wait for a mapper than are sent at once
 SEED = 3
@@ -87,7 +87,7 @@ class Robot:
             self.session.play()
             self._opened = True
         while self.session.next_ns() is not None:
-            self.frames.append(told(self.session.work()))
+            self.frames.append(content_of(self.session.work()))
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def test_what_came_so_far_is_mapped_again_while_more_comes(robot, parameters):
     assert here.frames == other.frames, "the rerun disturbs nothing that comes meanwhile"
     frame = done[0]
     assert frame.index == len(here.frames) - 1 >= begun
-    assert told(frame) == wanted.frames[-1]
+    assert content_of(frame) == wanted.frames[-1]
     for each in (here, wanted):
         each.send(SCANS)
     assert here.frames[frame.index + 1 :] == wanted.frames[frame.index + 1 :]

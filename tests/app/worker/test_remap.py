@@ -34,14 +34,14 @@ JUDGED = BASE.replace({"detection.e_max": 20.0})  # from the first scan on that 
 WIDER = BASE.replace({"clustering.eps": 0.25})  # looked at anew
 
 
-def told(record: object) -> object:
+def content_of(record: object) -> object:
     """Everything that a record holds, bit by bit, but for the numbers of trees, which stay those of the first
     map.
     """
     if isinstance(record, Trees):
         record = replace(record, number=np.zeros_like(record.number))
     if is_dataclass(record):
-        return tuple(told(getattr(record, f.name)) for f in fields(record))
+        return tuple(content_of(getattr(record, f.name)) for f in fields(record))
     if isinstance(record, np.ndarray):
         return (record.dtype.str, record.shape, record.tobytes())
     return repr(record)
@@ -83,7 +83,7 @@ def mapped_with(parameters: Parameters, last: int) -> tuple[object, object]:
 @cache
 def _mapped_once(parameters: str, last: int) -> tuple[object, object]:
     with mapped_from_start(Parameters.model_validate_json(parameters), last) as opened:
-        return told(opened.shown.frame), told(opened.shown.path)
+        return content_of(opened.shown.frame), content_of(opened.shown.path)
 
 
 def remapped(session: Session) -> tuple[Frame, MapChanges]:
@@ -101,7 +101,7 @@ def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters)
     session.set_parameters(parameters, 1, whole=True)
     assert session.is_remapping
     frame, changes = remapped(session)
-    assert (told(frame), told(session.shown.path)) == mapped_with(parameters, current)
+    assert (content_of(frame), content_of(session.shown.path)) == mapped_with(parameters, current)
     assert changes.revision == 1
     assert changes.scans == current + 1
     assert session.status().remapped is None
@@ -135,18 +135,18 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
         session.set_parameters(wanted, revision, whole=True)
         frame, changes = remapped(session)
         assert changes.revision == revision
-        now: tuple[object, ...] = (told(frame), told(session.shown.path))
-        now += (told(session.run.confirmed_s),)
+        now: tuple[object, ...] = (content_of(frame), content_of(session.shown.path))
+        now += (content_of(session.run.confirmed_s),)
         assert marks.setdefault(id(wanted), dict(changes.confirmed)) == dict(changes.confirmed)
         assert maps.setdefault(id(wanted), now) == now
     for wanted in (parameters, BASE, LATER):
         with mapped_from_start(wanted, LAST - 1) as other:
             assert other.shown.frame is not None
             assert isinstance(other.run, Run)
-            since = told(other.run.confirmed_s)
+            since = content_of(other.run.confirmed_s)
             confirmed = sorted(other.run._map.confirmed_s.values())
             assert sorted(marks[id(wanted)].values()) == confirmed, "those that went again too"
-            assert maps[id(wanted)] == (told(other.shown.frame), told(other.shown.path), since)
+            assert maps[id(wanted)] == (content_of(other.shown.frame), content_of(other.shown.path), since)
 
 
 @pytest.mark.parametrize("parameters", [FEWER, WIDER])
@@ -166,7 +166,7 @@ def test_undo_and_redo_of_the_last_change_map_only_the_current_scan_again(sessio
         session.set_parameters(wanted, revision, whole=True)
         frame, _ = remapped(session)
         assert set(mapped) == {frame.index}
-        assert (told(frame), told(session.shown.path)) == mapped_with(wanted, frame.index)
+        assert (content_of(frame), content_of(session.shown.path)) == mapped_with(wanted, frame.index)
 
 
 def places(frame: Frame) -> dict[int, tuple[float, float]]:
@@ -220,7 +220,7 @@ def test_once_the_run_goes_on_a_map_that_was_left_is_made_again(session):
     settle(session)
     session.set_parameters(BASE, 3, whole=True)
     frame, _ = remapped(session)
-    assert (told(frame), told(session.shown.path)) == mapped_with(BASE, frame.index)
+    assert (content_of(frame), content_of(session.shown.path)) == mapped_with(BASE, frame.index)
 
 
 @pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER])
@@ -230,7 +230,9 @@ def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parame
     for index in (6, 15):
         session.seek(0.1 * index)
         settle(session)
-        assert (told(session.shown.frame), told(session.shown.path)) == mapped_with(parameters, index)
+        assert (content_of(session.shown.frame), content_of(session.shown.path)) == mapped_with(
+            parameters, index
+        )
 
 
 def test_the_standing_scan_comes_first_then_the_preview_then_the_map(session, monkeypatch):
@@ -253,8 +255,8 @@ def test_the_standing_scan_comes_first_then_the_preview_then_the_map(session, mo
             assert session.remap() is None
             assert rerun.done <= 1
         frame, _ = remapped(session)
-        ((told_of, trees),) = heard
-        assert told_of == revision
+        ((of_revision, trees),) = heard
+        assert of_revision == revision
         assert abs(int(frame.trees.confirmed.sum()) - trees) <= 2
         heard.clear()
         segmented.clear()
@@ -285,22 +287,22 @@ def test_a_newer_change_stops_an_older_one(session):
         session.remap()
     session.set_parameters(FEWER, 2, whole=True)
     frame, _ = remapped(session)
-    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+    assert content_of(frame) == mapped_with(FEWER, frame.index)[0]
 
 
 def test_what_a_held_slider_changes_is_told_against_the_map_before_it_was_taken(session):
-    def told_after(parameters: Parameters, revision: int, step: int) -> MapChanges:
+    def changes_after(parameters: Parameters, revision: int, step: int) -> MapChanges:
         session.set_parameters(parameters, revision, whole=True, step=step)
         return remapped(session)[1]
 
     none = BASE.replace({"classification.tree_share": 1.0, "tracking.hits_to_confirm": 30})
-    first = told_after(FEWER, 1, 1)
-    second = told_after(none, 2, 1)
-    third = told_after(FEWER, 3, 1)
+    first = changes_after(FEWER, 1, 1)
+    second = changes_after(none, 2, 1)
+    third = changes_after(FEWER, 3, 1)
     assert first.ghost == second.ghost == third.ghost
     assert (first.before, first.after, first.changes) == (third.before, third.after, third.changes)
     assert second.after < second.before
-    other = told_after(BASE, 4, 2)
+    other = changes_after(BASE, 4, 2)
     assert other.before == third.after
 
 
@@ -324,7 +326,7 @@ def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done, para
     settle(session)
     frame, _ = remapped(session)
     assert frame.index == 15
-    assert told(frame) == mapped_with(parameters, 15)[0]
+    assert content_of(frame) == mapped_with(parameters, 15)[0]
 
 
 @pytest.mark.parametrize("parameters", [FEWER, LATER])
@@ -338,9 +340,9 @@ def test_it_goes_on_while_the_run_plays(session, parameters):
         session.work()
         done = session.remap() or session.remap()
     frame, _ = done
-    assert told(frame) == mapped_with(parameters, frame.index)[0]
+    assert content_of(frame) == mapped_with(parameters, frame.index)[0]
     after = session.work()
-    assert told(after) == mapped_with(parameters, frame.index + 1)[0]
+    assert content_of(after) == mapped_with(parameters, frame.index + 1)[0]
 
 
 def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeypatch):
@@ -357,10 +359,10 @@ def test_a_change_of_the_trees_maps_only_the_current_scan_again(session, monkeyp
         session.set_parameters(wanted, revision, whole=True)
         frame, _ = remapped(session)
         assert set(mapped) == {frame.index}
-        assert (told(frame), told(session.shown.path)) == mapped_with(wanted, frame.index)
+        assert (content_of(frame), content_of(session.shown.path)) == mapped_with(wanted, frame.index)
     session.seek(0.7)  # from a stored scan, or mapped again
     settle(session)
-    assert told(session.run.map_again()) == mapped_with(wanted, 7)[0]
+    assert content_of(session.run.map_again()) == mapped_with(wanted, 7)[0]
 
 
 def test_where_all_scans_are_stored_the_source_is_not_read(session, monkeypatch):
@@ -370,7 +372,7 @@ def test_where_all_scans_are_stored_the_source_is_not_read(session, monkeypatch)
     monkeypatch.setattr(session.run._cursor, "_read", nothing)
     session.set_parameters(WIDER, 1, whole=True)
     frame, _ = remapped(session)
-    assert told(frame) == mapped_with(WIDER, frame.index)[0]
+    assert content_of(frame) == mapped_with(WIDER, frame.index)[0]
 
 
 def results(session: Session, scans: int) -> list[object]:
@@ -429,7 +431,7 @@ def test_where_other_trees_close_another_loop_the_whole_run_is_mapped_again(sess
     monkeypatch.setattr(TreeRerun, "map_next", differs)
     session.set_parameters(LATER, 1, whole=True)
     frame, _ = remapped(session)
-    assert (told(frame), told(session.shown.path)) == mapped_with(LATER, frame.index)
+    assert (content_of(frame), content_of(session.shown.path)) == mapped_with(LATER, frame.index)
 
 
 def test_what_is_no_part_of_the_map_begins_nothing(session):
@@ -439,18 +441,18 @@ def test_what_is_no_part_of_the_map_begins_nothing(session):
 
 def test_what_cannot_be_read_again_leaves_the_map_and_says_so(session, monkeypatch):
     run = session.run
-    before = told(session.shown.frame)
+    before = content_of(session.shown.frame)
 
     def nothing(_index: int) -> Iterator[object]:
         raise SourceError("the disk is gone")
 
     monkeypatch.setattr(run._cursor, "again", nothing)
     session.set_parameters(WIDER, 1)
-    at_hand = told(session.shown.frame)
+    at_hand = content_of(session.shown.frame)
     session.set_parameters(WIDER, 2, whole=True)
     while session.is_remapping:
         assert session.remap() is None
-    assert told(session.shown.frame) == at_hand != before
+    assert content_of(session.shown.frame) == at_hand != before
     assert any("was not mapped again" in w and "the disk is gone" in w for w in session.status().warnings)
 
 
@@ -477,7 +479,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
     assert all("votes for a tree" in change.why or "does not confirm" in change.why for change in gone)
     assert [(c.x, c.y) for c in back.changes if c.kind == "appeared"] == [(c.x, c.y) for c in gone]
     assert back.after == known
-    assert told(again) == told(frame)
+    assert content_of(again) == content_of(frame)
     assert dict(back.confirmed) == marked, "also of those that went again, where each was confirmed first"
     assert set(marked) >= set(frame.trees.number[frame.trees.confirmed].tolist())
     assert all(0.0 <= time_s <= 12.0 for _, time_s in back.confirmed)
@@ -496,9 +498,9 @@ def test_a_change_on_the_way_to_another_scan_acts_on_the_whole_run_there(session
     settle(session)
     frame, changes = remapped(session)
     assert changes.revision == 2
-    assert told(frame) == mapped_with(FEWER, frame.index)[0]
+    assert content_of(frame) == mapped_with(FEWER, frame.index)[0]
     session.play()
-    assert told(session.work()) == mapped_with(FEWER, frame.index + 1)[0]
+    assert content_of(session.work()) == mapped_with(FEWER, frame.index + 1)[0]
 
 
 def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
@@ -531,4 +533,4 @@ def test_without_room_for_the_scans_they_are_read_once_more_and_that_is_said(mon
             for warning in session.status().warnings
         )
         frame, _ = remapped(session)
-        assert told(frame) == mapped_with(FEWER, frame.index)[0]
+        assert content_of(frame) == mapped_with(FEWER, frame.index)[0]

@@ -157,6 +157,20 @@ def test_a_long_chain_is_solved_to_its_end():
     assert abs(wrap_angle(again.pose[-1, 2] - first.pose[-1, 2])) < 0.1 * sigma
 
 
+def test_a_step_to_a_cost_that_is_no_number_is_no_solution(monkeypatch: pytest.MonkeyPatch):
+    graph, linearised = graph_of(arc(6), np.random.default_rng(1)), graph_solver.Problem._linearised
+    calls = []
+
+    def broken(*arguments):
+        cost, normal = linearised(*arguments)
+        calls.append(cost)
+        return cost if len(calls) == 1 else np.nan, normal
+
+    monkeypatch.setattr(graph_solver.Problem, "_linearised", broken)
+    assert graph.solve() is None
+    assert len(calls) > 2, "larger dampings were tried"
+
+
 def test_a_wrong_association_is_switched_off():
     true = arc(12)
     graph = graph_of(true, np.random.default_rng(1))

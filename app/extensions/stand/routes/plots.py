@@ -147,7 +147,8 @@ async def detour(dashboard: Dash) -> Response:
                 return json_reply(await opening.ask(question, patience_s=_DETOUR_S))
             except opening.TookTooLongError:
                 raise StemmapError(
-                    f"the way takes longer than {_DETOUR_S:.0f} s to find", remedy="Choose a smaller area"
+                    f"the way takes longer than {_DETOUR_S:.0f} s to find",
+                    remedy="The arcs around the trees show the sides that were never seen",
                 ) from None
 
 
