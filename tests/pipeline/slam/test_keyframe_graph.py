@@ -161,8 +161,8 @@ def test_a_step_to_a_cost_that_is_no_number_is_no_solution(monkeypatch: pytest.M
     graph, linearised = graph_of(arc(6), np.random.default_rng(1)), graph_solver.Problem._linearised
     calls = []
 
-    def broken(*arguments):
-        cost, normal = linearised(*arguments)
+    def broken(problem, x, l, quadratic_loops):  # noqa: E741
+        cost, normal = linearised(problem, x, l, quadratic_loops)
         calls.append(cost)
         return cost if len(calls) == 1 else np.nan, normal
 
