@@ -20,7 +20,7 @@ from app.robot.source import LiveSource
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import Outbox, RecentScans
 from app.worker.protocol import ToWorker, WireError, to_worker
-from app.worker.session import Session
+from app.worker.session import OpenSource, Session
 from pipeline.config import Parameters
 from pipeline.io.readers import path_of
 from pipeline.io.readers.base import Source, SourceOptions
@@ -29,21 +29,6 @@ from pipeline.jit import on_compiling
 # A scan that is being mapped, or a large file that is being opened, may take a moment to notice. A robot is
 # left in 2 to 5 s.
 _GRACE_S, _LIVE_GRACE_S = 1.0, 9.0
-
-
-def new_session() -> Session:
-    """Return a session that uses the real pipeline, for the worker and for commands that map in this
-    process."""
-    from app.store.forests import mapper_of
-    from app.worker.numba_warmup import compiling, warm_up
-
-    return Session(
-        open_source=open_any_or_one_step,
-        make_mapper=mapper_of,
-        parameters=Parameters(),
-        compiling=compiling,
-        warm_up=warm_up,
-    )
 
 
 def open_any_or_one_step(uri: str, options: SourceOptions) -> Source | LiveSource:
@@ -57,6 +42,25 @@ def open_any_or_one_step(uri: str, options: SourceOptions) -> Source | LiveSourc
     from app.sources.one_step import open_one_step
 
     return open_one_step(path_of(uri), options) or open_any(uri, options)
+
+
+def new_session(open_source: OpenSource = open_any_or_one_step) -> Session:
+    """Return a session that uses the real pipeline, for the worker and for commands that map in this
+    process.
+
+    Args:
+        open_source: Opens a source by its URI and options.
+    """
+    from app.store.forests import mapper_of
+    from app.worker.numba_warmup import compiling, warm_up
+
+    return Session(
+        open_source=open_source,
+        make_mapper=mapper_of,
+        parameters=Parameters(),
+        compiling=compiling,
+        warm_up=warm_up,
+    )
 
 
 def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:

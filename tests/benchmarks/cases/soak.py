@@ -64,7 +64,7 @@ def follow(server: Side, browser: Side) -> list[Reading]:
     """Return a reading after each part of the drive.
 
     Raises:
-        StemmapError: No scan was mapped for LONGEST_SILENCE_S.
+        StemmapError: No scan was mapped for LONGEST_SILENCE_S, or the drive ended before SCANS.
     """
     readings: list[Reading] = []
     pids, heard_at, last = server.ask({"do": "pids"}), time.monotonic(), -1
@@ -76,6 +76,8 @@ def follow(server: Side, browser: Side) -> list[Reading]:
         now = status["scan_index"] + 1
         if now != last:
             heard_at, last = time.monotonic(), now
+        elif status["state"] == "finished" and now < 0.99 * SCANS:
+            raise StemmapError(f"the drive ended before {SCANS:,} scans", where=f"scan {now:,}")
         elif status["state"] == "failed" or time.monotonic() > heard_at + LONGEST_SILENCE_S:
             raise StemmapError(
                 "no scan was mapped", where=f"scan {now}: {status['state']} {status['detail']}"

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from app.worker import process
+from app.worker.process import new_session, run_as_worker
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import FileSource, SourceOptions
 from pipeline.io.readers.simulated import open_simulated
@@ -92,5 +92,4 @@ def _open(uri: str, _options: SourceOptions) -> LoopedSource:
 
 
 if __name__ == "__main__":
-    setattr(process, "open_any_or_cloud", _open)  # noqa: B010 - the type checker takes it for something else
-    process.run_as_worker(process.new_session())
+    run_as_worker(new_session(_open))
