@@ -14,12 +14,12 @@ import numpy as np
 from app.batch.run_folder import read_run, read_seen_area
 from app.batch.visits import VisitComparison, VisitTrees, compare_visits, with_known_sigma
 from app.common.text import count, version
+from app.extensions.maps.localisation import Localisation, Localiser, State, StoredMap
 from pipeline.geometry.gaussian import spread_by_pose
 from pipeline.geometry.poses import Float, Pose2, Pose3, wrap_angle
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.recording.messages import map_odom_messages
 from pipeline.io.result_files import csv_text, number_text
-from pipeline.localisation import Localisation, Localiser, State, StoredMap
 from pipeline.seen_area import SeenArea
 from pipeline.slam.frame_uncertainty import transported_covariance
 from pipeline.types.records import Bool, Frame, HeightMap, Path

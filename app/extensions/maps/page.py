@@ -12,8 +12,8 @@ from app.common.timers import cancel
 
 if TYPE_CHECKING:
     from app.dashboard.dashboard import Dashboard
+    from app.extensions.maps.localisation import StoredMap
     from app.extensions.maps.localise import LocalisedRun
-    from pipeline.localisation import StoredMap
     from pipeline.types.records import Frame
 
 _log = logging.getLogger(__name__)

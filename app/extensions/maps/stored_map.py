@@ -8,10 +8,10 @@ import numpy as np
 
 from app.batch.run_folder import read_run, read_terrain
 from app.cli.stored import reviewed
+from app.extensions.maps.localisation import StoredMap
+from app.extensions.maps.localisation.stored_map import LARGEST_FILE
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
-from pipeline.localisation import StoredMap
-from pipeline.localisation.stored_map import LARGEST_FILE
 
 ENDING = ".stems"
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import chi2
 
-from pipeline.localisation import Localiser, State
-from pipeline.localisation.search import MapIndex, search_map
+from app.extensions.maps.localisation import Localiser, State
+from app.extensions.maps.localisation.search import MapIndex, search_map
 from pipeline.loop_closure.stem_matching import MapStems
 from tests.benchmarks.localise.drives import Drive, Reference, frame_offsets
 

@@ -17,8 +17,8 @@ from app.extensions.maps.page import Locating
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from tests.app.batch.finished_runs import write_run
+from tests.app.extensions.maps.localisation.stands import stand, trees_at
 from tests.app.server_for_tests import BEARER, running
-from tests.pipeline.localisation.stands import stand, trees_at
 
 
 async def until(condition: Callable[[], bool]) -> None:

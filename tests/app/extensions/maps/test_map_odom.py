@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.extensions.maps.localisation import Localisation, State
 from app.extensions.maps.localise import in_stored_map, map_odom
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers.topics import standard_types
-from pipeline.localisation import Localisation, State
 from pipeline.types.records import Frame, Path, PoseEstimate
-from tests.pipeline.localisation.stands import trees_at
+from tests.app.extensions.maps.localisation.stands import trees_at
 
 T_MAP_RUN = Pose2(10.0, -5.0, 0.7)
 BASE, ODOM = Pose2(3.0, 1.0, 0.2), Pose2(2.5, 1.5, -0.1)

@@ -21,10 +21,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import binom
 
+from app.extensions.maps.localisation.heights import HeightFix, align_heights
+from app.extensions.maps.localisation.search import (
+    SIGMA_XY,
+    MapFix,
+    MapIndex,
+    Prior,
+    false_alarms,
+    fix_near,
+    search_map,
+)
+from app.extensions.maps.localisation.stored_map import StoredMap
 from pipeline.geometry.poses import Float, Pose2, Pose3
-from pipeline.localisation.heights import HeightFix, align_heights
-from pipeline.localisation.search import SIGMA_XY, MapFix, MapIndex, Prior, false_alarms, fix_near, search_map
-from pipeline.localisation.stored_map import StoredMap
 from pipeline.loop_closure.stem_matching import MapStems, Match, worst_sigma
 from pipeline.slam.frame_uncertainty import transported_covariance
 from pipeline.slam.places import AGREEING, ODDS

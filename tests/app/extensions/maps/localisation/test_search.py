@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.localisation.search import MASK, MASK_NEAR, MapIndex, mask_pairs, ones
+from app.extensions.maps.localisation.search import MASK, MASK_NEAR, MapIndex, mask_pairs, ones
 from pipeline.loop_closure.stem_matching import cells_of
-from tests.pipeline.localisation.stands import stand, stored
+from tests.app.extensions.maps.localisation.stands import stand, stored
 
 
 def test_ones_counts_the_bits_of_a_word():

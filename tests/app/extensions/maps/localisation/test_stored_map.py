@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from app.extensions.maps.localisation import StoredMap
 from pipeline.errors import StemmapError
 from pipeline.io.checkpoints.codec import record_bytes
-from pipeline.localisation import StoredMap
-from tests.pipeline.localisation.stands import stand, trees_at
+from tests.app.extensions.maps.localisation.stands import stand, trees_at
 
 
 @dataclass

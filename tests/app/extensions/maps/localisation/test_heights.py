@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from app.extensions.maps.localisation.heights import align_heights
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.localisation.heights import align_heights
 
 
 def cells(side=20.0, cell=0.5):

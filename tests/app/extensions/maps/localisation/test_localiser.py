@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.extensions.maps.localisation import Localiser, State
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.localisation import Localiser, State
 from pipeline.types.records import Detections
-from tests.pipeline.localisation.stands import drive, planted, stand, stored, trees_at, way
+from tests.app.extensions.maps.localisation.stands import drive, planted, stand, stored, trees_at, way
 
 SIDE = 100.0
 

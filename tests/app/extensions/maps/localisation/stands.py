@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from app.extensions.maps.localisation import Localiser, StoredMap
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.localisation import Localiser, StoredMap
 from pipeline.types.records import Trees
 
 

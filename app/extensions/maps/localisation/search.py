@@ -29,9 +29,9 @@ from scipy.spatial import cKDTree
 from scipy.special import betaincinv
 from scipy.stats import binom
 
+from app.extensions.maps.localisation.stored_map import StoredMap
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.jit import compiled
-from pipeline.localisation.stored_map import StoredMap
 from pipeline.loop_closure.stem_matching import (
     LEAST,
     REACH,
