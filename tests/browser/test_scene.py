@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from itertools import pairwise
 from math import hypot
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import expect
@@ -15,6 +16,7 @@ from tests.browser.test_accessibility import violations
 
 pytestmark = pytest.mark.usefixtures("calm")
 
+SCRIPTS = Path(__file__).resolve().parents[2] / "static" / "js"
 MARKERS = "/world/robot/scan/markers"
 SEEN = """name => {
   const node = window.__viserSceneTree?.getState()[name];
@@ -200,6 +202,25 @@ def test_points_have_a_bounded_size_and_the_view_an_angle_of_45_degrees(dashboar
         return all.length > 0 && all.every(text => text.includes("clamp(scale")); }"""
     )
     assert dashboard.scene.evaluate("() => window.__viserMutable.camera.fov") == pytest.approx(45.0, abs=0.1)
+
+
+def test_one_file_uses_private_parts_of_the_client_of_viser():
+    used = [path.name for path in SCRIPTS.rglob("*.js") if "__viser" in path.read_text()]
+    assert used == ["viser_client.js"]
+
+
+def test_the_client_of_viser_has_the_private_parts_that_one_file_uses(dashboard: Dashboard):
+    dashboard.scene.wait_for_function("() => window.__viserMutable?.nodeRefFromName?.['/world/trees']")
+    missing = dashboard.scene.evaluate(
+        """() => {
+        const client = window.__viserMutable;
+        const { props } = window.__viserSceneTree.getState()['/world/trees'].message;
+        const parts = ["camera", "cameraControl", "canvas", "nodeRefFromName", "requestRender", "scene"];
+        return [...parts.filter(name => !client[name]),
+          ...["batched_positions", "batched_colors"].filter(name => !props[name])];
+    }"""
+    )
+    assert missing == []
 
 
 def test_a_preset_is_chosen_in_the_scene(dashboard: Dashboard):

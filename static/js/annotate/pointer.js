@@ -7,6 +7,7 @@ import { clusters, trees } from "../core/store.js";
 import { colours } from "../core/theme.js";
 import { drawCircle, drawText } from "../map/draw.js";
 import { onSceneLoad } from "../scene/scene.js";
+import { viewOf } from "../scene/viser_client.js";
 import { add, annotating, choose, draft, news, rowOf, rows, settle } from "./annotations.js";
 
 const SNAP = 0.7; // [m]
@@ -113,9 +114,9 @@ const STILL = 5; // [px]; a longer way between press and release turns the camer
 
 // The ray through a point of the window as two points in the frame of the map.
 function rayAt(inner, x, y) {
-  const { camera, canvas, nodeRefFromName } = inner.__viserMutable ?? {};
-  const world = nodeRefFromName?.["/world"];
-  if (!camera || !canvas || !world) return null;
+  const view = viewOf(inner);
+  if (!view) return null;
+  const { camera, canvas, world } = view;
   const box = canvas.getBoundingClientRect();
   const toMap = world.matrixWorld.clone().invert();
   const from = camera.getWorldPosition(camera.position.clone());

@@ -4,6 +4,7 @@
 import { byId, recall, remember } from "../core/dom.js";
 import { isPlaying, on, state } from "../core/store.js";
 import { onSceneLoad, onScenePress } from "./scene.js";
+import { viewOf } from "./viser_client.js";
 
 const NEAR = 12; // [m] largest distance from the selection after a flight
 const HEIGHT = 1.3; // [m] of the place that the camera looks at, above the ground
@@ -14,9 +15,10 @@ const isOn = () => button.getAttribute("aria-pressed") === "true";
 let scene = null, clickedAt = -CLICK, last = "";
 
 function fly([x, y, z]) {
-  const { camera, cameraControl: control, nodeRefFromName: nodes } = scene?.__viserMutable ?? {};
-  if (!control || !nodes?.["/world"]) return;
-  const target = camera.position.clone().set(x, y, z + HEIGHT).applyMatrix4(nodes["/world"].matrixWorld);
+  const at = viewOf(scene);
+  if (!at) return;
+  const { camera, control, world } = at;
+  const target = camera.position.clone().set(x, y, z + HEIGHT).applyMatrix4(world.matrixWorld);
   const away = control.getPosition(camera.position.clone()).sub(control.getTarget(camera.position.clone()));
   const from = target.clone().add(away.setLength(Math.min(away.length(), NEAR))); // the direction of view stays
   control.setLookAt(...from.toArray(), ...target.toArray(), !calm.matches);

@@ -3,11 +3,11 @@
 import { byId, recall, remember } from "../core/dom.js";
 import { on } from "../core/store.js";
 import { isDark } from "../core/theme.js";
+import { boundPointSizes, drawWorldWithItsContent, isBuilt } from "./viser_client.js";
 
 const frame = byId("scene");
 const loaders = [];
 const builders = [drawWorldWithItsContent, boundPointSizes, closeRenderingNotice];
-const POINT_PX = [1.5, 8]; // [px] smallest and largest diameter of a point
 const NOTICE_MS = 8000, LOOK_MS = 250, LOOKS = 40;
 
 export const onSceneLoad = (listener) => loaders.push(listener);
@@ -47,46 +47,6 @@ function keepReconnecting() {
   frame.contentWindow.dispatchEvent(new Event("focus"));
 }
 
-// viser's client draws a new pose of a node one picture before new content that arrived with it. What follows the robot is the
-// pose of the world, and everything in it is content: so the world is drawn one picture later, with the content of its scan.
-function drawWorldWithItsContent({ __viserMutable: viser }) {
-  const { scene, nodeRefFromName } = viser;
-  if (scene.userData.isInStep) return; // the window of a frame is the same object after a reload
-  scene.userData.isInStep = true;
-  let node = null, set = null, drawn = null; // the last position set by viser, and the drawn one
-  const then = scene.onBeforeRender;
-  scene.onBeforeRender = (...args) => {
-    then?.apply(scene, args);
-    const world = nodeRefFromName["/world"];
-    if (!world) return;
-    if (world !== node) [node, set, drawn] = [world, world.position.clone(), world.position.clone()];
-    const next = set;
-    if (!world.position.equals(drawn)) set = world.position.clone();
-    if (drawn.equals(next) && world.position.equals(drawn)) return;
-    drawn = next;
-    world.position.copy(drawn);
-    world.updateMatrix();
-    world.updateMatrixWorld(true);
-  };
-}
-
-// viser draws a point by its size in metres only: near the camera it would be a disc, and far away it would vanish.
-function boundPointSizes({ __viserMutable: { scene } }) {
-  if (scene.userData.hasBounds) return; // the window of a frame is the same object after a reload
-  scene.userData.hasBounds = true;
-  const then = scene.onBeforeRender;
-  scene.onBeforeRender = (...args) => {
-    then?.apply(scene, args);
-    const ends = POINT_PX.map((size) => (size * args[0].getPixelRatio()).toFixed(2)).join(", ");
-    scene.traverse(({ isPoints, material }) => {
-      if (!isPoints || material.userData.isBounded) return;
-      material.userData.isBounded = true;
-      material.vertexShader = material.vertexShader.replace("(scale / -world_pos.z)", `clamp(scale / -world_pos.z, ${ends})`);
-      material.needsUpdate = true;
-    });
-  };
-}
-
 // viser's notice about rendering in software covers a part of the scene. It closes by itself, and at once where this browser has
 // shown it before.
 function closeRenderingNotice(inner, looks = LOOKS) {
@@ -100,7 +60,7 @@ function closeRenderingNotice(inner, looks = LOOKS) {
 }
 
 function whenBuilt(frame, act) {
-  if (frame.__viserMutable?.scene && frame.__viserMutable.nodeRefFromName) act(frame);
+  if (isBuilt(frame)) act(frame);
   else if (frame === byId("scene").contentWindow) setTimeout(() => whenBuilt(frame, act), 200);
 }
 

@@ -5,6 +5,7 @@ import { byId, el, recall, remember } from "../core/dom.js";
 import { startPopover } from "../core/popover.js";
 import { on, state, trees } from "../core/store.js";
 import { onSceneBuilt } from "./scene.js";
+import { viewOf } from "./viser_client.js";
 
 const MOST_VIEWS = 20, MOST_SOURCES = 30, LONGEST_NAME = 40;
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
@@ -33,42 +34,36 @@ function keep(views) {
   show();
 }
 
-function parts() {
-  const { camera, cameraControl: control, nodeRefFromName: nodes } = scene?.__viserMutable ?? {};
-  return control && nodes?.["/world"] ? { camera, control, world: nodes["/world"].matrixWorld } : null;
-}
-
 // The present view in the frame of the map; null before the scene is there.
 function present() {
-  const at = parts();
+  const at = viewOf(scene);
   if (!at) return null;
-  const toMap = at.world.clone().invert(), point = () => at.camera.position.clone();
+  const toMap = at.world.matrixWorld.clone().invert(), point = () => at.camera.position.clone();
   return [at.control.getPosition(point()), at.control.getTarget(point())].flatMap((each) => each.applyMatrix4(toMap).toArray());
 }
 
 export function lookFrom(view) {
-  const at = parts();
+  const at = viewOf(scene);
   if (!at) return;
-  const [from, to] = [view.slice(0, 3), view.slice(3)].map((xyz) => at.camera.position.clone().set(...xyz).applyMatrix4(at.world));
+  const [from, to] = [view.slice(0, 3), view.slice(3)].map((xyz) => at.camera.position.clone().set(...xyz).applyMatrix4(at.world.matrixWorld));
   at.control.setLookAt(...from.toArray(), ...to.toArray(), !calm.matches);
 }
 
 // Where the camera stood when the scene was loaded, relative to the robot if it is followed.
 function keepHome(inner) {
-  const at = parts();
+  const at = viewOf(scene);
   if (scene !== inner) return;
   if (!at) setTimeout(() => keepHome(inner), HOME_MS);
   else home = [at.control.getPosition(at.camera.position.clone()), at.control.getTarget(at.camera.position.clone())].flatMap((each) => each.toArray());
 }
 
 function goHome() {
-  if (!home || !parts()) return;
-  parts().control.setLookAt(...home, !calm.matches);
+  if (home) viewOf(scene)?.control.setLookAt(...home, !calm.matches);
 }
 
 // From above and behind, so that path and trees are in the picture.
 function fit() {
-  const places = [...state.path.map(([x, y]) => [x, y]), ...trees().map(({ x, y }) => [x, y])], at = parts();
+  const places = [...state.path.map(([x, y]) => [x, y]), ...trees().map(({ x, y }) => [x, y])], at = viewOf(scene);
   if (!places.length || !at) return;
   const [xs, ys] = [0, 1].map((axis) => places.map((place) => place[axis]));
   const ends = [xs, ys].map((all) => [all.reduce((a, b) => Math.min(a, b)), all.reduce((a, b) => Math.max(a, b))]);

@@ -6,16 +6,11 @@ import { clock, count } from "../core/format.js";
 import { access, endViewerLink, looksOnly, refreshAccess, startAccess } from "../core/permissions.js";
 import { attempted, showProblem } from "../core/problem.js";
 import { on, state } from "../core/store.js";
+import { controlOf, sentOf } from "../scene/viser_client.js";
 
 const PATIENCE = 120_000; // [ms] for a run to open
 const frame = byId("scene");
-const controls = () => {
-  try {
-    return frame.contentWindow?.__viserMutable?.cameraControl ?? null;
-  } catch {
-    return null; // the scene failed to load: its frame holds an error page of the browser
-  }
-};
+const controls = () => controlOf(frame.contentWindow);
 const rounded = (values) => values.map((value) => value.toFixed(2)).join(",");
 
 function camera() {
@@ -131,7 +126,7 @@ async function lookFrom(values) {
   // The scene sets its initial camera some frames after its start, so the camera of the link must have held for a while.
   for (let stood = 0; stood < 4;) {
     await new Promise((resolve) => setTimeout(resolve, 300));
-    const standing = frame.contentWindow?.__viserSceneTree?.getState()["/world/robot/scan/raw"] ? camera() : null;
+    const standing = sentOf(frame.contentWindow, "/world/robot/scan/raw") ? camera() : null;
     if (standing === null) continue;
     stood = standing === rounded(values) ? stood + 1 : 0;
     if (!stood) controls().setLookAt(...values, false);
