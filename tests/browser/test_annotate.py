@@ -266,9 +266,11 @@ def test_the_name_is_asked_until_it_is_given_and_stored_with_answers(person: Das
     page = person.page
     ask = page.locator("#annotate-ask")
     expect(ask).to_be_visible()
+    expect(page.locator("#annotate-name")).to_be_hidden()
     page.locator("#annotate-asked").fill("Ann")
     page.locator("#annotate-asked").press("Enter")
     expect(ask).to_be_hidden()
+    expect(page.locator("#annotate-name")).to_be_visible()
     expect(page.locator("#annotate-name")).to_have_value("Ann")
     page.locator("#map").press("s")
     person.answer("y")

@@ -54,7 +54,7 @@ const panels = () => [
   ...BUTTONS.filter(([, , id]) => exists(id)).map(([title, tab, id]) => [title, "", edits(pressIn(tab, id))]),
   [`Re-map the whole run after a change: switch ${state.parameters?.whole ?? true ? "off" : "on"}`, "", edits(() => { toTab("tune")(); attempt(() => put("/api/parameters/reach", { whole: !(state.parameters?.whole ?? true) })); })],
   ["Download the annotations as CSV", "", () => location.assign("/api/annotations.csv")], ["Download the annotations as GeoJSON", "", () => location.assign("/api/annotations.geojson")],
-  ["Annotate: your name", "", edits(() => { toTab("annotate")(); byId("annotate-name").focus(); })],
+  ["Annotate: your name", "", edits(() => { toTab("annotate")(); byId(byId("annotate-ask").hidden ? "annotate-name" : "annotate-asked").focus(); })],
   ...(state.annotations?.own == null ? [] : AGAINST.map(([value, words]) => [`Score against ${words}`, "", edits(() => { toTab("scores")(); scoreAgainst(value); })])),
   ["Upload a recording", "", edits(async () => { await openSources(); byId("upload-choose").focus(); })],
   ["Connect a robot or a sensor", "", edits(connectRobot)],
