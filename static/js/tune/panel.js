@@ -27,7 +27,7 @@ function build() {
     if (chosen.size > LARGEST_FILE) refuse(`${chosen.name} is larger than ${LARGEST_FILE / 1000} kB, so it is not a parameter file.`);
     else await takeFile(chosen.name, await chosen.text());
   } });
-  const find = el("input", { id: "tune-find", type: "search", placeholder: "Find a parameter", "aria-label": "Find a parameter by name, stage or meaning", autocomplete: "off", oninput: sift });
+  const find = el("input", { id: "tune-find", type: "search", placeholder: "Find", "aria-label": "Find a parameter by name, stage or meaning", autocomplete: "off", oninput: sift });
   const only = el("input", { id: "tune-only", type: "checkbox", "aria-label": "Changed only", onchange: sift });
   const main = tuning.specs.filter((spec) => spec.main).sort((a, b) => (a.stage === "Filters") - (b.stage === "Filters")); // as in the panel of the scene
   const others = tuning.specs.filter((spec) => !spec.main);
