@@ -25,7 +25,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
 
     Args:
         uri: A simulated scenario ("sim:stand"), a file or a folder. The format is detected by the contents
-            first, then by the name. A folder that is no run and has one recording in it is that recording.
+            first, then by the name. A folder that is no run and has one recording or run in it is that.
         options: Choices of the user; None for the defaults.
 
     Raises:
@@ -39,8 +39,10 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         if scheme is not None and not Path(uri).exists():
             return _open_scheme(scheme.group(1).lower(), uri, chosen)
         path = Path(uri).expanduser()
-        if path.is_dir() and folder_opener(path) is None and len(names := recordings_in(path)) == 1:
-            return open_source(str(path / names[0]), chosen)
+        if path.is_dir() and folder_opener(path) is None:
+            names = recordings_in(path) + folders_of_runs(path)
+            if len(names) == 1:
+                return open_source(str(path / names[0]), chosen)
         return _find_opener(path, uri, chosen)(uri, path, chosen)
     except RuntimeError as error:  # the home folder of an unknown user
         raise SourceError("there is no such user", where=uri, remedy="Look at the path.") from error
@@ -335,13 +337,18 @@ def recordings_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.is_file() and is_recording(path))
 
 
-def folders_of_runs(folder: Path) -> list[str]:
-    """Return the sorted names, with a slash, of the folders in a folder that are runs or contain recordings;
-    without those that cannot be read. OSError if the folder itself cannot be read."""
+def folders_of_runs(folder: Path, *, levels: int = 2) -> list[str]:
+    """Return the sorted names, with a slash, of the folders in a folder that are runs or contain recordings
+    or runs, up to some levels; without those that cannot be read. OSError if the folder itself cannot be
+    read."""
     found = []
     for path in sorted(folder.iterdir()):
         with suppress(OSError):
-            if path.is_dir() and (folder_opener(path) or recordings_in(path)):
+            if path.is_dir() and (
+                folder_opener(path)
+                or recordings_in(path)
+                or (levels > 1 and folders_of_runs(path, levels=levels - 1))
+            ):
                 found.append(f"{path.name}/")
     return found
 

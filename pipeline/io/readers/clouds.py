@@ -178,8 +178,9 @@ class PointCloud:
                     xyz = xyz - self.description.offset
                 good = is_place(xyz)
                 read += len(xyz)
-                if not good.all():
-                    count_loss(self.losses, self._table.invalid, int(np.count_nonzero(~good)))
+                bad = ~good & ~np.isnan(xyz).all(axis=1) if self._table.has_voids else ~good
+                if bad.any():
+                    count_loss(self.losses, self._table.invalid, int(np.count_nonzero(bad)))
                 yield xyz[good].astype(np.float32)
         except OSError as error:
             what = f"cannot read: {error.strerror or error}"
@@ -502,7 +503,7 @@ def _open_e57(path: Path) -> PointTable:
                     yield dict(zip(_AXES, xyz.T, strict=True))
 
     kind = f"E57, {stations} station{'s' * (stations != 1)}"
-    return PointTable(kind, sum(points), _AXES, read, starts=tuple(starts), units=("m", "m"))
+    return PointTable(kind, sum(points), _AXES, read, has_voids=True, starts=tuple(starts), units=("m", "m"))
 
 
 def _station(file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types

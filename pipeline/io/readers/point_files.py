@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss
 from pipeline.io.readers.pose_files import read_rows
-from pipeline.io.readers.scan_columns import POINT_LIMIT
+from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT
 from pipeline.jit import compiled
 from pipeline.types.records import Float
 
@@ -101,6 +101,7 @@ class PointTable:
         low, high: Corners by the header, shape (3,) [m]; not checked. None if unknown.
         cut_above: Whether the field of view of a sensor cuts the trees, as in the cloud of a drive.
         invalid: What is counted for a point whose coordinates are not finite or too large.
+        has_voids: Whether a point with NaN is stated by the file to be none, which is not counted.
         starts: Points from which `read` can begin without reading those before; () for any.
         units: Units of x and y, and of z, by the file itself, as in `cloud_frame.UNITS`; "" if it names none.
         exact: Whether `points` is a number that the file promises, and no estimate.
@@ -118,6 +119,7 @@ class PointTable:
     high: Float | None = None
     cut_above: bool = False
     invalid: str = "points without coordinates"
+    has_voids: bool = False
     starts: tuple[int, ...] = ()
     units: tuple[str, str] = ("", "")
     exact: bool = True
@@ -154,16 +156,61 @@ def is_table(head: bytes) -> bool:
     return head.startswith((*_PLY, *_PCD, _NPY, *_ZIP))
 
 
+#: Rows of .bin files, of float32 each: KITTI, nuScenes, Boreas. Those of NCLT are whole numbers.
+_ROWS = (
+    ("KITTI .bin", ("x", "y", "z", "intensity")),
+    ("nuScenes .bin", ("x", "y", "z", "intensity", "ring")),
+    ("Boreas .bin", ("x", "y", "z", "intensity", "ring", "time")),
+)
+_NCLT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
+#: Unit and offset of the coordinates of NCLT, and height that its sensor does not see beyond [m].
+_NCLT_UNIT, _NCLT_ZERO, _NCLT_HIGHEST = 0.005, -100.0, 50.0
+_TESTED_ROWS = 48_000  # bytes, whole rows of each kind
+_FITTING = 0.99  # share of rows that are sound by the right layout; the rest is damage
+
+
 def open_rows(path: Path) -> PointTable:
-    """Return the table of a KITTI .bin file: x, y, z and reflectance as float32.
+    """Return the table of a .bin file, whose rows have no header: those of KITTI (x, y, z and reflectance as
+    float32), unless only those of nuScenes, Boreas or NCLT give positions and reflectances.
 
     Raises:
         ScanFileError: It is too large, or shorter than a point.
-        OSError: The size of the file cannot be read.
+        OSError: The file cannot be read.
     """
     size = path.stat().st_size
-    dtype = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
-    return _binary_table(path, "KITTI .bin", size // dtype.itemsize, [_Stream(0, dtype, size)])
+    with path.open("rb") as file:
+        head = file.read(_TESTED_ROWS)
+    for kind, names in _ROWS:
+        dtype = np.dtype([(name, "<f4") for name in names])
+        if size % dtype.itemsize == 0 and _are_rows(_first_rows(head, dtype)):
+            return _binary_table(path, kind, size // dtype.itemsize, [_Stream(0, dtype, size)])
+    if size % _NCLT.itemsize == 0 and _are_rows(_metres(_first_rows(head, _NCLT))):
+        table = _binary_table(path, "NCLT .bin", size // _NCLT.itemsize, [_Stream(0, _NCLT, size)])
+        return replace(table, read=lambda begin: (_metres(part) for part in table.read(begin)))
+    kind, names = _ROWS[0]
+    dtype = np.dtype([(name, "<f4") for name in names])
+    return _binary_table(path, kind, size // dtype.itemsize, [_Stream(0, dtype, size)])
+
+
+def _first_rows(head: bytes, dtype: np.dtype[Any]) -> Columns:
+    """Return the columns of the whole rows at the beginning of a file."""
+    rows = np.frombuffer(head, dtype, len(head) // dtype.itemsize)
+    return {name: rows[name] for name in dtype.names or ()}
+
+
+def _metres(columns: Columns) -> Columns:
+    """Return columns of NCLT with coordinates in metres."""
+    axes = {axis: columns[axis].astype(np.float64) * _NCLT_UNIT + _NCLT_ZERO for axis in "xyz"}
+    return {**columns, **axes}
+
+
+def _are_rows(columns: Columns) -> bool:
+    """Return whether nearly all rows have coordinates of a scan and a reflectance."""
+    x, y, z, reflectance = (columns[name].astype(np.float64) for name in _ROWS[0][1])
+    with np.errstate(invalid="ignore"):
+        sound = (np.maximum(np.abs(x), np.abs(y)) < RANGE_LIMIT) & (np.abs(z) < _NCLT_HIGHEST)
+        sound &= reflectance >= 0.0
+    return bool(sound.size and sound.mean() > _FITTING)
 
 
 def open_table(path: Path) -> PointTable:

@@ -22,32 +22,64 @@ TEXT_LIMIT = 64 << 20
 R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _STILL = 0.05
 TUM_COLUMNS, KITTI_COLUMNS = 8, 12
-POSE_ROWS = "t x y z qx qy qz qw (TUM) or the 12 numbers of a 3 x 4 matrix (KITTI)"
+POSE_ROWS = "t x y z qx qy qz qw (TUM) or the 12 numbers of a 3 x 4 matrix (KITTI), also after a time"
 
 
 class TextError(Exception):
     """A text file does not have the expected contents; the message gives the reason."""
 
 
-def read_poses(path: Path) -> list[Pose3]:
-    """Return poses of the LiDAR (x forward) from a file, one per row.
+def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
+    """Return times and poses of the LiDAR (x forward) from a file: TUM rows t x y z qx qy qz qw or rows of a
+    time and a 3 x 4 matrix with times [ns], int64, shape (N,), or KITTI rows of a matrix (times None).
 
-    A row has the 12 numbers of a 3 x 4 matrix. KITTI writes the poses of its left camera (x right, y down, z
-    forward); others write those of the LiDAR. If a file `calib.txt` with a valid row `Tr:` is in the same
-    folder, they are KITTI poses. Otherwise the motion decides: a robot moves along z of a camera or along x
-    of a LiDAR.
+    Blanks, commas or semicolons separate the numbers. The names in a first line, such as
+    `#sec,nsec,x,y,z,qx,qy,qz,qw`, tell the order of the columns. KITTI writes the poses of its left camera (x
+    right, y down, z forward); others write those of the LiDAR. If a file `calib.txt` with a valid row `Tr:`
+    is in the same folder, they are KITTI poses. Otherwise the motion decides: a robot moves along z of a
+    camera or along x of a LiDAR.
 
     Raises:
-        TextError: The file has another format, matrices that are not rotations, or positions of
-            COORDINATE_LIMIT or more.
+        TextError: The file has neither format, times that do not strictly ascend or cannot be read, a
+            quaternion of length 0, or positions of COORDINATE_LIMIT or more.
         OSError: The file cannot be read.
     """
-    rows = read_table(path, KITTI_COLUMNS).reshape(-1, 3, 4)
+    names, lines = _named_lines(path)
+    columns = len(lines[0]) if lines else 0
+    found = _named_columns(names, columns) or _COLUMNS.get(columns)
+    if found is None:
+        raise TextError(f"its rows have {columns} columns; readable are {POSE_ROWS}")
+    if any(len(line) != columns for line in lines):
+        raise TextError(f"its rows do not have {columns} numbers")
+    time, pose = found
+    rows = _table([[line[k] for k in pose] for line in lines], len(pose))
+    times = _times([[line[k] for k in time] for line in lines]) if time else None
+    if times is not None and np.any(np.diff(times) <= 0):
+        raise TextError("its times do not ascend")
+    if len(pose) == KITTI_COLUMNS:
+        T_camera_lidar = None if time else _calibration(path.with_name("calib.txt"))
+        return times, _poses_of_matrices(rows.reshape(-1, 3, 4), T_camera_lidar)
+    _check_positions(rows[:, :3])
+    try:
+        return times, [Pose3.from_quaternion(row[:3], row[[6, 3, 4, 5]]) for row in rows]
+    except ValueError as error:
+        raise TextError("it has a quaternion of no length") from error
+
+
+def _poses_of_matrices(rows: Float, T_camera_lidar: Pose3 | None) -> list[Pose3]:
+    """Return poses of the LiDAR from matrices, shape (N, 3, 4), see `read_any_poses`.
+
+    Args:
+        rows: The matrices.
+        T_camera_lidar: Pose of the LiDAR in the frame whose poses they are; None if it is unknown.
+
+    Raises:
+        TextError: They are not rotations, or positions are COORDINATE_LIMIT or more.
+    """
     _check_positions(rows[:, :, 3])
     R, t = rows[:, :, :3], rows[:, :, 3]
     if not _are_rotations(R):
         raise TextError("its matrices are no rotations")
-    T_camera_lidar = _calibration(path.with_name("calib.txt"))
     if T_camera_lidar is None and _moves_along_z(R, t):
         T_camera_lidar = Pose3(R_LIDAR_CAMERA.T, np.zeros(3))
     poses = [Pose3(_nearest_rotation(rotation), shift) for rotation, shift in zip(R, t, strict=True)]
@@ -57,52 +89,85 @@ def read_poses(path: Path) -> list[Pose3]:
     return [T_lidar_camera @ pose @ T_camera_lidar for pose in poses]
 
 
-def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
-    """Return times and poses of the LiDAR from a file: TUM rows t x y z qx qy qz qw with times [ns], int64,
-    shape (N,), or KITTI rows (times None, see `read_poses`).
-
-    Raises:
-        TextError: The file has neither format, times that do not strictly ascend or cannot be read, a
-            quaternion of length 0, or positions of COORDINATE_LIMIT or more.
-        OSError: The file cannot be read.
-    """
-    lines = _lines(path)
-    columns = len(lines[0]) if lines else 0
-    if columns not in (TUM_COLUMNS, KITTI_COLUMNS):
-        raise TextError(f"its rows have {columns} columns; readable are {POSE_ROWS}")
-    return read_tum_poses(path) if columns == TUM_COLUMNS else (None, read_poses(path))
-
-
 def read_tum_poses(path: Path) -> tuple[Int, list[Pose3]]:
-    """Return times [ns], int64, shape (N,), N >= 1, and poses of a file of TUM rows t x y z qx qy qz qw.
-
-    Raises:
-        TextError: The file has another format, times that do not strictly ascend or cannot be read, a
-            quaternion of length 0, or positions of COORDINATE_LIMIT or more.
-        OSError: The file cannot be read.
-    """
-    lines = _lines(path)
-    rows = _table(lines, TUM_COLUMNS)
-    _check_positions(rows[:, 1:4])
-    times = _times(line[0] for line in lines)
-    if np.any(np.diff(times) <= 0):
-        raise TextError("its times do not ascend")
-    try:
-        return times, [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in rows]
-    except ValueError as error:
-        raise TextError("it has a quaternion of no length") from error
+    """Return times [ns], int64, shape (N,), N >= 1, and poses of a file whose rows have times; errors as
+    `read_any_poses`, also if they have none."""
+    times, poses = read_any_poses(path)
+    if times is None:
+        raise TextError("its rows have no times")
+    return times, poses
 
 
-def _times(seconds: Iterable[str]) -> Int:
-    """Return decimal seconds as nanoseconds, int64, shape (N,): a float has too few digits for them.
+#: Columns of the time and of the pose (x y z qx qy qz qw or a matrix) by the number of columns; two columns
+#: of a time are its seconds and nanoseconds.
+_COLUMNS: dict[int, tuple[list[int], list[int]]] = {
+    KITTI_COLUMNS: ([], list(range(12))),
+    TUM_COLUMNS: ([0], list(range(1, 8))),
+    TUM_COLUMNS + 1: ([0, 1], list(range(2, 9))),
+    KITTI_COLUMNS + 1: ([0], list(range(1, 13))),
+}
+#: Names of the columns x y z qx qy qz qw, in lower case without a unit in brackets.
+_AXES = tuple(re.compile(rf"(?:[pt]|p.*_|pos.*[._])?{axis}(?:_?m)?") for axis in "xyz") + tuple(
+    re.compile(rf"(?:q|q.*_|.*rot.*[._]|.*orient.*[._]){axis}") for axis in "xyzw"
+)
+_SECONDS, _NANOSECONDS = re.compile(r"secs?|seconds"), re.compile(r"n_?secs?|nanosec.*|ns")
+_UNIT = re.compile(r"\[.*?\]|\(.*?\)|[%#\s\"']")
+
+
+def _named_columns(names: list[str], columns: int) -> tuple[list[int], list[int]] | None:
+    """Return the columns of time and pose, as in _COLUMNS, by their names; None if they do not tell them."""
+    if len(names) != columns:
+        return None
+    pose = [[k for k, name in enumerate(names) if axis.fullmatch(name)] for axis in _AXES]
+    if any(len(found) != 1 for found in pose):
+        return None
+    first = min(found[0] for found in pose)
+    is_split = first > 1 and _SECONDS.fullmatch(names[first - 2]) and _NANOSECONDS.fullmatch(names[first - 1])
+    time = [first - 2, first - 1] if is_split else [first - 1][:first]
+    return time, [found[0] for found in pose]
+
+
+def _named_lines(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Return the names of the columns in the first line, in lower case without units and signs of a comment,
+    [] if it has none, and the words of the rows; errors as `_lines`."""
+    text = _text(path)
+    first = text.lstrip("\ufeff").split("\n", 1)[0].strip()
+    split = re.split(r"[,;]", first) if re.search(r"[,;]", first) else first.lstrip("%# ").split()
+    names = [_UNIT.sub("", word).lower() for word in split]
+    if not any(re.search(r"[a-df-z]", name) and not name.startswith(("nan", "inf")) for name in names):
+        return [], _words(text)
+    rows = _words(text.lstrip("\ufeff").partition("\n")[2])
+    return (names, rows) if rows else ([], _words(text))
+
+
+def _times(stamps: Iterable[list[str]]) -> Int:
+    """Return times as nanoseconds, int64, shape (N,): a float has too few digits for them.
+
+    Args:
+        stamps: Words of each time: one (see `time_ns`), or whole seconds and nanoseconds.
 
     Raises:
         TextError: A word is not a number, or too large.
     """
     try:
-        return np.array([seconds_ns(word) for word in seconds], dtype=np.int64)
+        found = [
+            time_ns(words[0]) if len(words) == 1 else int(words[0]) * 1_000_000_000 + int(words[1])
+            for words in stamps
+        ]
+        return np.array(found, dtype=np.int64)
     except (ValueError, OverflowError) as error:
         raise TextError("its times are no seconds") from error
+
+
+#: Factors by which a time since 1970 without decimals becomes nanoseconds, by its digits.
+_DIGITS = {13: 1_000_000, 16: 1000, 19: 1}
+
+
+def time_ns(text: str) -> int:
+    """Return a time as integer nanoseconds: decimal seconds (see `seconds_ns`, also for errors), or milli-,
+    micro- or nanoseconds since 1970 without decimals."""
+    factor = _DIGITS.get(len(text)) if text.isascii() and text.isdigit() else None
+    return seconds_ns(text) if factor is None else int(text) * factor
 
 
 def seconds_ns(text: str) -> int:
@@ -135,7 +200,7 @@ def read_times(path: Path) -> Int:
     """
     lines = [" ".join(words) for words in _lines(path)]
     try:
-        times = _times(lines)
+        times = _times([[line] for line in lines])
     except TextError:
         times = np.array([_date(line) for line in lines], dtype=np.int64)
     if not len(times):
@@ -177,19 +242,14 @@ def _lines(path: Path) -> list[list[str]]:
         TextError: The file is larger than TEXT_LIMIT, or is not UTF-8.
         OSError: The file cannot be read.
     """
-    return [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
+    return _words(_text(path))
 
 
-def read_table(path: Path, columns: int) -> Float:
-    """Return the rows of a file of finite numbers with magnitudes below 1e10, shape (rows, columns), at least
-    one row; empty lines and lines that begin with # are skipped.
-
-    Raises:
-        TextError: The file is larger than TEXT_LIMIT or is not UTF-8, or it has no rows, a row with another
-            number of words, or a word that is not such a number.
-        OSError: The file cannot be read.
-    """
-    return _table(_lines(path), columns)
+def _words(text: str) -> list[list[str]]:
+    """Return the words of each line that is not empty and does not begin with # or %, separated by blanks,
+    commas or semicolons."""
+    lines = (line for line in text.split("\n") if line.strip() and not line.startswith(("#", "%")))
+    return [re.sub(r"[,;]", " ", line).split() for line in lines]
 
 
 def _table(lines: list[list[str]], columns: int) -> Float:

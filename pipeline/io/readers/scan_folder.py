@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -21,11 +22,10 @@ from pipeline.io.readers.firing_order import FIRING_ORDER
 from pipeline.io.readers.mounting import assumed_mounting
 from pipeline.io.readers.point_files import Columns, ScanFileError, open_rows, open_table, read_columns
 from pipeline.io.readers.point_times import PointTimes, decide_point_times
-from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns
+from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns, time_ns
 from pipeline.io.readers.scan_columns import (
     FARTHEST_MEDIAN,
     NO_METRES,
-    POINT_LIMIT,
     RANGE_LIMIT,
     median_range,
     scan_of,
@@ -36,9 +36,11 @@ from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor
 
 #: Period of scans without times: 10 Hz.
 STEP_NS = 100_000_000
-#: Usual names of files with times and with poses.
+#: Usual names of files with times and with poses; further texts with such a word in their names are poses.
 TIMES = ("times.txt", "timestamps.txt")
 POSES = ("poses.txt", "poses.tum", "trajectory.txt", "trajectory.tum", "groundtruth.txt")
+_POSE_WORDS = re.compile(r"pose|traj|odom", re.IGNORECASE)
+_TEXTS = (".txt", ".csv", ".tum")
 _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
 #: Number of unreadable files at the start after which the folder is refused.
 _TRIES = 20
@@ -53,8 +55,9 @@ Loader = Callable[[Path, int, PointTimes | None, dict[str, int]], Scan]
 class ScanFolder(FileSource):
     """Source of scans from files, in the order of the numbers in their names.
 
-    Poses (odometry; `poses.txt` and the other names of POSES, in KITTI or TUM format) and `times.txt` or
-    `timestamps.txt` are read from the folder or its parent. The number in the name of a scan file is its row
+    Poses (odometry; `poses.txt`, the other names of POSES and other texts with such words in their names, see
+    `read_any_poses`) and `times.txt` or `timestamps.txt` are read from the folder or its parent; poses with
+    times also from two folders above. The number in the name of a scan file is its row
     in them, or its index in the folder when there are as many rows as files; if neither fits, a warning is
     given and they are not used. Without a file of times, the times are those in the names of the scans
     (1645000000.25.pcd), else those of TUM rows. TUM rows are matched to scans by time where both have times.
@@ -102,7 +105,10 @@ class ScanFolder(FileSource):
         self._timed = False
         self._stamp = self._read_stamps(places, numbers)
         self._T_base_lidar = options.T_base_lidar or Pose3.identity()
-        self._poses = self._read_poses(places, numbers) or self._read_views()
+        self._poses = self._read_poses([*places, *(place.parent for place in places[1:])], numbers)
+        self._poses = self._poses or self._read_views()
+        if self._poses is None and not self._timed and options.form != "scan":
+            _refuse_clouds(self._files, self._suffix, uri)
         if self._poses is not None:
             self._find_frame(self._poses)
         self._times = self._decide_times()
@@ -207,7 +213,11 @@ class ScanFolder(FileSource):
         """Return the pose of each scan (None for scans without one) by the first file of poses that fits;
         None if there is none. Times of its rows replace those of scans without times, and the file is added
         to the files of the digest. Arguments as in `_read_stamps`."""
-        for path, (times, poses) in self._read_texts(places, POSES, read_any_poses):
+        names = [*POSES, *_names_of_poses(places)]
+        for path, (times, poses) in self._read_texts(places, names, read_any_poses):
+            # Two folders above, there may be other runs: only times show that rows belong to this one.
+            if path.parent in places[2:] and (times is None or not self._timed):
+                continue
             found = self._fitting(path.name, times, poses, numbers)
             if found is not None:
                 self._texts.append(path)
@@ -335,6 +345,34 @@ class ScanFolder(FileSource):
         return None
 
 
+def _names_of_poses(places: list[Path]) -> list[str]:
+    """Return the sorted names of further texts in some folders that have poses by their names; those in
+    folders that cannot be read are left out."""
+    found = set[str]()
+    for place in places:
+        with suppress(OSError):
+            found.update(p.name for p in place.iterdir() if p.suffix in _TEXTS and _POSE_WORDS.search(p.stem))
+    return sorted(found.difference(POSES))
+
+
+def _refuse_clouds(files: list[Path], suffix: str, uri: str) -> None:
+    """Raise SourceError if the first of several files in a format of whole clouds, or all parts of one cloud
+    as tiles of it, is one by its points."""
+    if len(files) < 2 or suffix not in (".las", ".laz", ".ply"):
+        return
+    try:
+        table = open_points(files[0])
+        form = form_of(table, sample_of(table))
+    except (ScanFileError, OSError):
+        return
+    if form.is_cloud:
+        raise SourceError(
+            f"its {len(files)} {suffix} files are clouds or tiles of one, not scans of a drive: {form.why}",
+            where=uri,
+            remedy="Merge the tiles into one file, or map each by itself; --as scan takes them as scans",
+        )
+
+
 def _form_words(file: Path) -> list[str]:
     """Return why one file is taken as one scan, if its contents decide that; else []."""
     try:
@@ -377,7 +415,8 @@ def _in_order(files: list[Path]) -> list[Path]:
     """Return files sorted by the times in their names if all names are times, else by the numbers at the ends
     of their names (those without a number first); equal ones by name."""
     by_time = all(_TIME_NAME.fullmatch(file.stem) for file in files)
-    return sorted(files, key=lambda f: (_name_ns(f.stem) if by_time else _number(f), f.name))
+    keys = _names_ns(files) if by_time else [_number(file) for file in files]
+    return [file for _, _, file in sorted(zip(keys, [f.name for f in files], files, strict=True))]
 
 
 def _times_in_names(files: list[Path]) -> Int | None:
@@ -385,18 +424,21 @@ def _times_in_names(files: list[Path]) -> Int | None:
     the times do not strictly ascend."""
     if not all(_TIME_NAME.fullmatch(file.stem) for file in files):
         return None
-    stamps = [_name_ns(file.stem) for file in files]
+    stamps = _names_ns(files)
     return np.array(stamps, dtype=np.int64) if np.all(np.diff(stamps) > 0) else None
 
 
-def _name_ns(stem: str) -> int:
-    """Return the time in a file name [ns]: seconds with decimals, microseconds (16 digits) or nanoseconds (19
-    digits) since 1970; 0 for other names."""
-    match = _TIME_NAME.fullmatch(stem)
-    word = match.group(1) if match else "0"
-    if "." in word or "_" in word:
-        return seconds_ns(word.replace("_", "."))
-    return int(word) * (1000 if len(word) == 16 else 1)
+def _names_ns(files: list[Path]) -> list[int]:
+    """Return the times in the names of files [ns]: seconds with decimals, or seconds and a whole number of
+    smaller units, which may lack its leading zeros, or milli-, micro- or nanoseconds since 1970; 0 for other
+    names."""
+    words = [match.group(1) if (match := _TIME_NAME.fullmatch(file.stem)) else "0" for file in files]
+    digits = max((len(word.partition("_")[2]) for word in words), default=0)
+    return [
+        seconds_ns(f"{whole}.{units.zfill(digits)}") if units else time_ns(word)
+        for word in words
+        for whole, _, units in [word.partition("_")]
+    ]
 
 
 def _number(file: Path) -> int:
@@ -413,7 +455,7 @@ HDL_64 = Sensor("HDL-64", 64, float(np.radians(0.4)), float(np.radians(0.17)), 0
 
 
 def load_bin(path: Path, stamp_ns: int, times: PointTimes | None, losses: dict[str, int]) -> Scan:
-    """Read a KITTI .bin file as a scan, which may have no points. Invalid returns are left out
+    """Read a .bin file (see `open_rows`) as a scan, which may have no points. Invalid returns are left out
     (`clean_scan`); an incomplete last row is left out and counted in `losses`.
 
     Args:
@@ -426,18 +468,15 @@ def load_bin(path: Path, stamp_ns: int, times: PointTimes | None, losses: dict[s
         ScanFileError: The file is too large, or most of its rows are not positions.
         OSError: The file cannot be read.
     """
-    size = path.stat().st_size
-    if size > POINT_LIMIT * _KITTI_ROW:
-        raise ScanFileError(f"{size} bytes are too many for one scan")
-    rows = np.fromfile(path, dtype="<f4", count=size // _KITTI_ROW * 4).reshape(-1, 4)
+    table = open_rows(path)
+    columns = read_columns(table, losses)
     with np.errstate(invalid="ignore"):
-        sound = (np.abs(rows[:, :3]) < RANGE_LIMIT).all(axis=1)
-    if 2 * int(np.count_nonzero(sound)) < len(rows):
+        sound = np.all([np.abs(columns[axis]) < RANGE_LIMIT for axis in "xyz"], axis=0)
+    if 2 * int(np.count_nonzero(sound)) < len(sound):
         raise ScanFileError("most of its rows are no positions")
-    scan = scan_of(stamp_ns, dict(zip(("x", "y", "z", "intensity"), rows.T, strict=True)), times)
-    if size % _KITTI_ROW:
+    if table.kind == "KITTI .bin" and path.stat().st_size % _KITTI_ROW:
         count_loss(losses, "scan files that end within a point")
-    return scan
+    return scan_of(stamp_ns, columns, times)
 
 
 def load_table(path: Path, stamp_ns: int, times: PointTimes | None, losses: dict[str, int]) -> Scan:

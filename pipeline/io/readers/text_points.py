@@ -16,7 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.io.readers.point_files import DEGREES, MOST_POINTS, Columns, PointTable, ScanFileError
+from pipeline.io.readers.ptx import is_ptx, open_ptx
 from pipeline.types.records import Float
 
 HEAD = 64 << 10  # bytes in which the layout is found
@@ -100,11 +102,8 @@ def open_text(path: Path) -> PointTable:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(HEAD)
-        if _is_ptx(head):
-            raise ScanFileError(
-                "it is a PTX file, whose stations have own frames and poses, which are not read",
-                "Export it in one frame, as .e57, .laz or .pts",
-            )
+        if is_ptx(head):
+            return open_ptx(path)
         layout = find_layout(head)
         file.seek(layout.start)
         lines = ends = 0
@@ -151,13 +150,6 @@ def open_text(path: Path) -> PointTable:
         units=(layout.unit, layout.unit),
         exact=layout.count is not None,
     )
-
-
-def _is_ptx(head: bytes) -> bool:
-    """Return whether a text begins with the header of a PTX station: columns and rows of the scan, four lines
-    of three numbers (position and axes), four lines of four numbers (transform)."""
-    widths = [len(line.split()) for line in head.splitlines() if line.strip()][:10]
-    return widths == [1, 1, 3, 3, 3, 3, 4, 4, 4, 4]
 
 
 def find_layout(head: bytes) -> _Layout:
@@ -248,7 +240,7 @@ def _layout_of(
     if not columns:
         if _are_poses(cells, decimal_comma):
             raise ScanFileError(*_poses())
-        first = int(_are_numbered(cells))
+        first = int(_are_numbered(cells) or _are_timed(cells, decimal_comma))
         columns = dict(zip("xyz", range(first, first + 3), strict=True))
         if not all(_NUMBER.fullmatch(cell) for cell in cells[0][first : first + 3]):
             raise ScanFileError(
@@ -331,6 +323,15 @@ def _are_numbered(cells: list[list[bytes]]) -> bool:
         return False
     numbers = [int(row[0]) for row in cells]
     return all(number == numbers[0] + k for k, number in enumerate(numbers))
+
+
+def _are_timed(cells: list[list[bytes]], decimal_comma: bool) -> bool:
+    """Return whether the first of at least four columns has times since 1970 or 1980, which are larger than
+    any coordinate."""
+    return all(
+        len(row) >= 4 and _NUMBER.fullmatch(row[0]) and _as_float(row[0], decimal_comma) >= COORDINATE_LIMIT
+        for row in cells
+    )
 
 
 def _are_poses(cells: list[list[bytes]], decimal_comma: bool) -> bool:

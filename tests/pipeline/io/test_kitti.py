@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import SourceOptions
-from pipeline.io.readers.pose_files import R_LIDAR_CAMERA, read_poses
+from pipeline.io.readers.pose_files import R_LIDAR_CAMERA, read_any_poses
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 
@@ -89,7 +89,7 @@ def test_poses_are_those_of_the_lidar_however_they_are_written(camera: bool, tmp
     written = [T_lidar_camera.inverse() @ pose @ T_lidar_camera for pose in poses] if camera else poses
     path = tmp_path / "poses.txt"
     path.write_text(matrices(written))
-    for read, expected in zip(read_poses(path), poses, strict=True):
+    for read, expected in zip(read_any_poses(path)[1], poses, strict=True):
         np.testing.assert_allclose(read.t, expected.t, atol=1e-9)
         np.testing.assert_allclose(read.R, expected.R, atol=1e-9)
 
@@ -101,14 +101,14 @@ def test_the_calibration_beside_the_poses_is_used(tmp_path: Path):
     (tmp_path / "poses.txt").write_text(
         matrices([T_camera_lidar @ p @ T_camera_lidar.inverse() for p in poses])
     )
-    for read, expected in zip(read_poses(tmp_path / "poses.txt"), poses, strict=True):
+    for read, expected in zip(read_any_poses(tmp_path / "poses.txt")[1], poses, strict=True):
         np.testing.assert_allclose(read.t, expected.t, atol=1e-9)
 
 
 def test_a_calibration_with_a_reflection_is_not_used(tmp_path: Path):
     (tmp_path / "calib.txt").write_text("Tr: 1 0 0 1 0 -1 0 2 0 0 1 3\n")
     (tmp_path / "poses.txt").write_text(matrices(curve(10)))
-    for read, expected in zip(read_poses(tmp_path / "poses.txt"), curve(10), strict=True):
+    for read, expected in zip(read_any_poses(tmp_path / "poses.txt")[1], curve(10), strict=True):
         np.testing.assert_allclose(read.t, expected.t, atol=1e-9)
 
 

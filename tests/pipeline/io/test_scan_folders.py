@@ -232,3 +232,96 @@ def test_the_poses_in_the_headers_move_the_scans(in_world: bool, views: bool, tm
         np.testing.assert_allclose(found.T_odom_base.t, pose.t, atol=1e-6)
         np.testing.assert_allclose(found.T_odom_base.R, pose.R, atol=1e-6)
     np.testing.assert_allclose(scans[3].points, np.load(tmp_path / "first.points.npy"), atol=1e-4)
+
+
+def written(layout: str, xyz: np.ndarray) -> bytes:
+    """Rows of a .bin file as data sets write them."""
+    rng = np.random.default_rng(1)
+    reflectance, ring = rng.uniform(0.0, 1.0, len(xyz)), np.arange(len(xyz)) % 32
+    if layout == "NCLT":
+        rows = np.zeros(len(xyz), [("xyz", "<u2", 3), ("i", "u1"), ("l", "u1")])
+        rows["xyz"], rows["i"], rows["l"] = np.rint((xyz + 100.0) / 0.005), 30, ring
+        return rows.tobytes()
+    further = {"KITTI": 0, "nuScenes": 1, "Boreas": 2}[layout]
+    columns = [ring, -rng.uniform(0.0, 0.1, len(xyz))][:further]
+    return np.column_stack([xyz, reflectance, *columns]).astype("<f4").tobytes()
+
+
+@pytest.mark.parametrize("layout", ["KITTI", "nuScenes", "Boreas", "NCLT"])
+def test_rows_of_bin_files_are_those_of_the_data_set(layout: str, tmp_path: Path, opened: Opened):
+    for k in range(3):
+        (tmp_path / f"{1_326_030_975_726_043 + k * 100_000}.bin").write_bytes(written(layout, points(k)))
+    source = opened(tmp_path)
+    scans = [record for record in source.records() if isinstance(record, Scan)]
+    np.testing.assert_allclose(scans[1].points, points(1), atol=3e-3)
+    assert scans[1].stamp_ns - scans[0].stamp_ns == 10**8
+    assert source.losses == {}
+
+
+def of_newer_college(poses: list[Pose3]) -> str:
+    """Seconds and nanoseconds apart, the latter without leading zeros."""
+    rows = [
+        f"{START_S + (9 + k) // 10},{(9 + k) % 10 * 10**8 + 7},{','.join(map(str, p.t))},{x},{y},{z},{w}"
+        for k, p in enumerate(poses)
+        for w, x, y, z in [p.quaternion()]
+    ]
+    return "#sec,nsec,x,y,z,qx,qy,qz,qw\n" + "\n".join(rows) + "\n"
+
+
+def of_wild_places(poses: list[Pose3]) -> str:
+    """A header that is no comment."""
+    return "timestamp,x,y,z,qx,qy,qz,qw\n" + tum(poses, START_S).partition("\n")[2].replace(" ", ",")
+
+
+def of_euroc(poses: list[Pose3]) -> str:
+    """Nanoseconds, and w before x, y, z."""
+    head = "#timestamp [ns], " + ", ".join(
+        [f"p_RS_R_{a} [m]" for a in "xyz"] + [f"q_RS_{a} []" for a in "wxyz"]
+    )
+    rows = [
+        ", ".join(map(str, [START_S * 10**9 + k * 10**8, *p.t, *p.quaternion()])) for k, p in enumerate(poses)
+    ]
+    return "\n".join([head, *rows]) + "\n"
+
+
+def of_mulran(poses: list[Pose3]) -> str:
+    """Nanoseconds and a matrix."""
+    rows = matrices(poses).splitlines()
+    return "".join(f"{START_S * 10**9 + k * 10**8},{row.replace(' ', ',')}\n" for k, row in enumerate(rows))
+
+
+@pytest.mark.parametrize("text", [of_newer_college, of_wild_places, of_euroc, of_mulran])
+def test_poses_are_read_as_data_sets_write_them(text: Callable[[list[Pose3]], str], tmp_path: Path):
+    path = tmp_path / "registered_poses.csv"
+    path.write_text(text(curve(12)))
+    times, poses = read_any_poses(path)
+    assert times is not None
+    assert (np.diff(times) == 10**8).all()
+    np.testing.assert_allclose([p.t for p in poses], [p.t for p in curve(12)], atol=1e-9)
+    np.testing.assert_allclose([p.R for p in poses], [p.R for p in curve(12)], atol=1e-9)
+
+
+@pytest.mark.parametrize("place", [".", "Ouster/..", "data/../.."])
+def test_a_folder_with_one_folder_of_scans_is_this_run(place: str, tmp_path: Path, opened: Opened):
+    folder = tmp_path / "sequence" / "sensor_data" / "Ouster"
+    folder.mkdir(parents=True)
+    for k in range(12):  # nanoseconds without leading zeros
+        write(folder / f"cloud_{START_S + (9 + k) // 10}_{(9 + k) % 10 * 10**8 + 7}.pcd", k)
+    (tmp_path / "sequence" / "global_pose.csv").write_text(of_newer_college(curve(12)))
+    source = opened({".": folder, "Ouster/..": folder.parent, "data/../..": tmp_path / "sequence"}[place])
+    records = list(source.records())
+    poses = [record.T_odom_base for record in records if isinstance(record, Odometry)]
+    np.testing.assert_allclose([p.t for p in poses], [p.t for p in curve(12)], atol=1e-9)
+    scans = [record.stamp_ns for record in records if isinstance(record, Scan)]
+    assert (np.diff(scans) == 10**8).all()
+
+
+def test_a_folder_of_tiles_of_a_cloud_is_no_drive(tmp_path: Path):
+    xyz = np.random.default_rng(2).uniform(-10.0, 10.0, (40_000, 3))
+    for east in (False, True):
+        las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+        las.header.scales = [0.001] * 3
+        las.x, las.y, las.z = xyz[(xyz[:, 0] > 0.0) == east].T
+        las.write(str(tmp_path / f"plot_{int(east)}.laz"))
+    with pytest.raises(SourceError, match=r"its 2 \.laz files are clouds or tiles of one"):
+        open_source(str(tmp_path))

@@ -169,14 +169,50 @@ def test_a_folder_lists_texts_of_points_and_no_other_texts(tmp_path: Path):
     assert recordings_in(tmp_path) == ["plot.csv", "plot.pts"]
 
 
+def ptx(points: np.ndarray, t: list[float], yaw: float) -> str:
+    """A station with 100 directions of no return, whose points are given in the frame of the file."""
+    R = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    axes = "".join("{} {} {}\n".format(*row) for row in R.T)
+    matrix = "".join("{} {} {} 0\n".format(*row) for row in R.T) + "{} {} {} 1\n".format(*t)
+    rows = "".join("{:.6f} {:.6f} {:.6f} 0.5 9 9 9\n".format(*row) for row in (points - t) @ R)
+    head = f"{len(points) // 100 + 1}\n100\n" + "{} {} {}\n".format(*t) + axes + matrix
+    return head + 100 * "0 0 0 0.500000 0 0 0\n" + rows
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize("stations", [1, 2])
+def test_stations_of_a_ptx_file_are_read_in_one_frame(tmp_path: Path, stations: int, end: str):
+    path = tmp_path / "plot.ptx"
+    parts = np.split(POINTS[:400], stations)
+    path.write_text(
+        "".join(ptx(part, [5.0 + k, 6.0, 1.6], 0.7 * k) for k, part in enumerate(parts)), newline=end
+    )
+    cloud = open_cloud(str(path))
+    np.testing.assert_allclose(np.concatenate(list(cloud.parts())), POINTS[:400], atol=2e-6)
+    assert cloud.losses == {}
+    assert cloud.description.kind.startswith(f"PTX, {stations} station")
+
+
+def test_a_cut_ptx_file_is_read_up_to_its_end(tmp_path: Path):
+    path = tmp_path / "plot.ptx"
+    path.write_text("\n".join(ptx(POINTS[:400], [0.0, 0.0, 1.6], 0.0).splitlines()[:310]) + "\n")
+    cloud = open_cloud(str(path))
+    assert sum(map(len, cloud.parts())) == 200
+    assert cloud.losses == {"points that the files promise but do not hold": 200}
+
+
 @pytest.mark.parametrize("name", ["plot.ptx", "plot.txt"])
-def test_a_ptx_file_is_refused_as_its_stations_would_lie_on_one_another(tmp_path: Path, name: str):
-    station = "10\n100\n5 6 1.6\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n5 6 1.6 1\n"
+def test_a_ptx_file_is_refused_if_its_stations_would_lie_on_one_another(tmp_path: Path, name: str):
     path = tmp_path / name
-    path.write_text(2 * (station + 1000 * "1.5 2.5 0.5 0.7\n"))
-    with pytest.raises(SourceError, match="PTX") as caught:
+    path.write_text(2 * ptx(POINTS[:400], [5.0, 6.0, 1.6], 0.0))
+    with pytest.raises(SourceError, match="not registered"):
         open_cloud(str(path))
-    assert ".e57" in caught.value.remedy
+
+
+def test_times_before_the_coordinates_are_no_coordinates(tmp_path: Path):
+    path = tmp_path / "plot.txt"
+    path.write_text(lines(POINTS, "1654001234.123456 {x} {y} {z} 20"))
+    np.testing.assert_allclose(np.concatenate(list(open_cloud(str(path)).parts())), POINTS, atol=1e-5)
 
 
 def test_utf_16_says_what_to_do(tmp_path: Path):
