@@ -44,6 +44,8 @@ _TEXTS = (".txt", ".csv", ".tum")
 _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
 #: Number of unreadable files at the start after which the folder is refused.
 _TRIES = 20
+#: Points of a tile of a cloud; the form of files with fewer points is not clear.
+_TILE = 20_000
 #: Distance of a sensor from the origin by which the frame of its points is known [m].
 _DECISIVE = 1.0
 
@@ -356,8 +358,7 @@ def _names_of_poses(places: list[Path]) -> list[str]:
 
 
 def _refuse_clouds(files: list[Path], suffix: str, uri: str) -> None:
-    """Raise SourceError if the first of several files in a format of whole clouds, or all parts of one cloud
-    as tiles of it, is one by its points."""
+    """Raise SourceError if the first of several files in a format of whole clouds is one by its points."""
     if len(files) < 2 or suffix not in (".las", ".laz", ".ply"):
         return
     try:
@@ -365,7 +366,7 @@ def _refuse_clouds(files: list[Path], suffix: str, uri: str) -> None:
         form = form_of(table, sample_of(table))
     except (ScanFileError, OSError):
         return
-    if form.is_cloud:
+    if form.is_cloud and table.points >= _TILE:
         raise SourceError(
             f"its {len(files)} {suffix} files are clouds or tiles of one, not scans of a drive: {form.why}",
             where=uri,

@@ -317,7 +317,7 @@ def test_a_folder_with_one_folder_of_scans_is_this_run(place: str, tmp_path: Pat
 
 
 def test_a_folder_of_tiles_of_a_cloud_is_no_drive(tmp_path: Path):
-    xyz = np.random.default_rng(2).uniform(-10.0, 10.0, (40_000, 3))
+    xyz = np.random.default_rng(2).uniform(-10.0, 10.0, (60_000, 3))
     for east in (False, True):
         las = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
         las.header.scales = [0.001] * 3
