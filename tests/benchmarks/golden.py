@@ -77,7 +77,7 @@ class Result:
 
 def _write_oxford(folder: Path) -> None:
     """Write the Oxford Evo stems, every fifth frame, with perturbed odometry (see `cases.oxford`)."""
-    from pipeline.io.readers.tree_manager import TRAJECTORY, trajectory_text
+    from app.extensions.formats.tree_manager import TRAJECTORY, trajectory_text
     from tests.benchmarks.cases.oxford import BIAS, DISTANCE, TURN
     from tests.benchmarks.tree_manager_folder import perturbed, read_recorded, write_states
 

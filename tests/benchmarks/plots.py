@@ -65,7 +65,7 @@ def mapped(source: Source, seed: int, title: str, truth_name: str, truth: TruthP
 
 def oxford() -> Drawn:
     """The benchmark's first seed."""
-    from pipeline.io.readers.tree_manager import TRAJECTORY, trajectory_text
+    from app.extensions.formats.tree_manager import TRAJECTORY, trajectory_text
     from tests.benchmarks.cases.oxford import BIAS, DISTANCE, TURN
     from tests.benchmarks.tree_manager_folder import perturbed, read_recorded, write_states
 

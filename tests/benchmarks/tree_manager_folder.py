@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from app.extensions.formats.tree_manager import state_name, state_text
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.io.readers.tree_manager import state_name, state_text
 from pipeline.types.records import Int, TruthPath
 from pipeline.types.records import Path as DrivenPath
 

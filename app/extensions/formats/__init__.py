@@ -1,29 +1,55 @@
-"""The extension `formats`: readers of files that few have."""
+"""The extension `formats`: readers of files that few have, and the folder of stems for other programs."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from app.extension import Extension
 
 if TYPE_CHECKING:
-    from pipeline.io.readers import Format, Source, SourceOptions
+    from pipeline.io.readers import Format, PacketFormat
+
+_PCAP = (
+    b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x0a\x0d\x0d\x0a"
+)  # fmt: skip
 
 
-def _open_victoria_park(uri: str, path: Path, options: SourceOptions) -> Source:
-    """Open the archive; errors are those of the reader."""
-    from app.extensions.formats.victoria_park import VictoriaParkSource
-
-    return VictoriaParkSource(uri, path, options)
+def _later(module: str, name: str) -> Callable[..., Any]:
+    """Return a function that imports a module of this extension and calls its member when it is called."""
+    return lambda *given: getattr(import_module(f"{__name__}.{module}"), name)(*given)
 
 
-def _formats() -> tuple[Format, ...]:
+def _is_tree_manager(names: Collection[str]) -> bool:
+    """Return whether a folder with these files is one of TreeManager."""
+    return any(name.startswith("TreeManagerState_") for name in names)
+
+
+def _formats() -> tuple[Format | PacketFormat, ...]:
     """Return the formats."""
-    from pipeline.io.readers import Format
+    from pipeline.io.readers import Format, PacketFormat
+    from pipeline.io.readers.sensor_families import HESAI_SCANS, OUSTER_PACKETS
 
-    words = "Victoria Park .zip (LASER.txt, DRS.txt)"
-    return (Format(words, (b"PK\x03\x04",), (".zip",), _open_victoria_park),)
+    stems = "a folder of TreeManagerState_<i>.csv with trajectory.txt"
+    return (
+        Format("Velodyne, Hesai or Ouster .pcap", _PCAP, (".pcap",), _later("capture", "open_capture")),
+        Format(
+            "Victoria Park .zip (LASER.txt, DRS.txt)",
+            (b"PK\x03\x04",),
+            (".zip",),
+            _later("victoria_park", "VictoriaParkSource"),
+        ),
+        Format(stems, (), (), _later("tree_manager", "TreeManagerSource"), is_folder=_is_tree_manager),
+        PacketFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "PacketDecoder")),
+        PacketFormat(
+            "raw packets of Ouster", OUSTER_PACKETS, recording=_later("ouster", "with_packets_decoded")
+        ),
+    )
 
 
-EXTENSION = Extension(help="readers of rare files: the archive of Victoria Park", formats=_formats)
+EXTENSION = Extension(
+    help="readers of rare files: packet captures, packets of Hesai and Ouster, TreeManager, Victoria Park",
+    takes={"export": "app.extensions.formats.export_command"},
+    formats=_formats,
+)

@@ -4,7 +4,7 @@ first, then by the names."""
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -12,8 +12,9 @@ from pathlib import Path
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
+from pipeline.io.readers.packets import PacketFormat
 
-__all__ = ["Source", "SourceDescription", "SourceOptions", "open_source", "path_of"]
+__all__ = ["PacketFormat", "Source", "SourceDescription", "SourceOptions", "open_source", "path_of"]
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+]+):")
 _LIVE = ("udp", "tcp", "ros2")
@@ -139,7 +140,7 @@ def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
             f"the contents are not those of a {promised.words} file" if promised else "not a LiDAR recording"
         )
         raise SourceError(what, where=uri, remedy=readable())
-    return kind.open
+    return opener_of(kind)
 
 
 # --- formats ---------------------------------------------------------------------------------------
@@ -163,7 +164,6 @@ def _opener(module: str, function: str) -> Opener:
 _recording = _opener("live", "open_recording")
 _scans = _opener("scan_folder", "ScanFolder")
 _cloud = _opener("simulated", "open_cloud_drive")
-_tree_manager = _opener("tree_manager", "TreeManagerSource")
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +178,8 @@ class Format:
         is_cloud: Whether it is usually a whole cloud.
         holds_points: Whether it is a file of points: a whole cloud or one scan.
         depends_on_contents: Whether its contents decide which of them, see `cloud_or_scan`.
+        is_folder: Whether a folder with files of these names is of this format; None for a format of files.
+        refusal: Why it cannot be used, as the remedy of an error; "" if it can.
     """
 
     words: str
@@ -187,6 +189,19 @@ class Format:
     is_cloud: bool = False
     holds_points: bool = False
     depends_on_contents: bool = False
+    is_folder: Callable[[Collection[str]], bool] | None = None
+    refusal: str = ""
+
+
+def opener_of(kind: Format) -> Opener:
+    """Return the opener of a format; it raises a SourceError if the format cannot be used."""
+
+    def refused(uri: str, path: Path, options: SourceOptions) -> Source:
+        """Raise the error."""
+        del path, options
+        raise SourceError(f"{kind.words} needs an extension", where=uri, remedy=kind.refusal)
+
+    return refused if kind.refusal else kind.open
 
 
 def _points(
@@ -196,14 +211,10 @@ def _points(
     return Format(words, magic, suffixes, _cloud if is_cloud else _scans, is_cloud, True, by_contents)
 
 
-_PCAP = (
-    b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x0a\x0d\x0d\x0a"
-)  # fmt: skip
 FILES = (
     Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _recording),
     Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
-    Format("Velodyne, Hesai or Ouster .pcap", _PCAP, (".pcap",), _opener("capture", "open_capture")),
     _points(".pcd (whole cloud or scan)", (b"# .PCD", b"VERSION", b"FIELDS"), ".pcd", is_cloud=False),
     _points("whole cloud .laz or .las", (b"LASF",), ".laz", ".las", by_contents=False),
     _points("whole cloud .e57", (b"ASTM-E57",), ".e57", by_contents=False),
@@ -219,18 +230,23 @@ _MOST_NAMED = 5
 #: Suffixes of text that is a cloud only if its lines are points: poses, times and true trees have them too.
 _TEXTS = (".txt", ".csv")
 TEXT = FILES[-1]
-_further: list[Callable[[], Iterable[Format]]] = []
+_further: list[Callable[[], Iterable[Format | PacketFormat]]] = []
 
 
-def add_formats(further: Callable[[], Iterable[Format]]) -> None:
+def add_formats(further: Callable[[], Iterable[Format | PacketFormat]]) -> None:
     """Add formats to those of this package, which go first. The function is called whenever a file is
     opened."""
     _further.append(further)
 
 
 def formats() -> tuple[Format, ...]:
-    """Return all formats of files in the order in which they are tried."""
-    return (*FILES, *(kind for further in _further for kind in further()))
+    """Return all formats of files and folders in the order in which they are tried."""
+    return (*FILES, *(kind for further in _further for kind in further() if isinstance(kind, Format)))
+
+
+def packet_formats() -> tuple[PacketFormat, ...]:
+    """Return the formats of packets in ROS messages that were added."""
+    return tuple(kind for further in _further for kind in further() if isinstance(kind, PacketFormat))
 
 
 def readable() -> str:
@@ -238,10 +254,10 @@ def readable() -> str:
     folders = (
         "a folder of .bin, .pcd, .ply, .npy, .npz, .las or .laz scans",
         "a rosbag2 folder",
-        "a folder of TreeManagerState_<i>.csv with trajectory.txt",
         "sim:stand and the other sim: scenarios.",
     )
-    return "Supported formats: " + ", ".join([*(kind.words for kind in formats()), *folders])
+    words = (kind.words for kind in formats() if not kind.refusal)
+    return "Supported formats: " + ", ".join([*words, *folders])
 
 
 def file_format(path: Path, head: bytes) -> Format | None:
@@ -363,11 +379,12 @@ def named(names: list[str]) -> str:
 def folder_opener(folder: Path) -> Opener | None:
     """Return the opener of a folder by the names of the files in it, and of `velodyne/*.bin`; None if nothing
     in it can be read, or it has several ROS recordings without metadata.yaml, which are runs of their own.
-    Where several formats fit, the order is TreeManager, ROS recording, scans. OSError if the folder cannot be
-    read."""
+    Where several formats fit, the order is formats that were added, ROS recording, scans. OSError if the
+    folder cannot be read."""
     names = {path.name for path in folder.iterdir() if path.is_file()}
-    if any(name.startswith("TreeManagerState_") for name in names):
-        return _tree_manager
+    added = next((kind for kind in formats() if kind.is_folder is not None and kind.is_folder(names)), None)
+    if added is not None:
+        return opener_of(added)
     suffixes = [Path(name).suffix.lower() for name in names]
     bags = suffixes.count(".mcap") + suffixes.count(".db3")
     if bags > 1 and "metadata.yaml" not in names:

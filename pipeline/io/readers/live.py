@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from pipeline.errors import SourceError
+from pipeline.io.readers import packet_formats
 from pipeline.io.readers.base import (
     RecordedTopic,
     Revision,
@@ -24,7 +25,6 @@ from pipeline.io.readers.base import (
 from pipeline.io.readers.camera import SAME_TIME_NS, MessageSource, find_camera, picture_of, time_beside
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import header_stamp
-from pipeline.io.readers.ouster import with_packets_decoded
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
 from pipeline.io.readers.ros_first_scans import EmptyScansError
@@ -543,7 +543,10 @@ def open_recording(uri: str, path: Path, options: SourceOptions) -> Source:
         run = read_live_header(container, uri)
         if run is not None:
             return LiveRecording(uri, container, run, paths, options)
-        return RosSource(uri, with_packets_decoded(container, path, options, uri), paths, options)
+        for kind in packet_formats():
+            if kind.recording is not None and not kind.refusal:
+                container = kind.recording(container, path, options, uri)
+        return RosSource(uri, container, paths, options)
     except BaseException:
         container.close()
         raise

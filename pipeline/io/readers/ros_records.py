@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import hesai
+from pipeline.io.readers import packet_formats
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.livox import CUSTOM_TYPES, CustomMsg, decode_custom
 from pipeline.io.readers.measured_poses import Fix, GnssFrame, NoPoseError, OtherFrame, OtherPose
 from pipeline.io.readers.message_time import header_stamp
+from pipeline.io.readers.packets import PacketFormat, SweepDecoder
 from pipeline.io.readers.point_times import (
     LONGEST_NS,
     PointTimes,
@@ -38,10 +40,11 @@ from pipeline.io.readers.topics import (
     NAV_SAT_FIX,
     ODOMETRY,
     POINT_CLOUD,
+    VELODYNE_SCAN,
     decode,
 )
 from pipeline.io.readers.transforms import TransformTree, frame_name, pose_of
-from pipeline.io.readers.velodyne import SENSORS, PacketDecoder, is_data_packet
+from pipeline.io.readers.velodyne import PacketDecoder
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor
 from pipeline.types.units import SECOND_NS
 
@@ -211,7 +214,7 @@ class RecordDecoder:
     ) -> None:
         """Create a decoder without a base frame and frames of measured poses."""
         self._channels, self._tree = channels, tree
-        self._packets = PacketDecoder()
+        self._decoders: dict[str, SweepDecoder] = {VELODYNE_SCAN: PacketDecoder()}
         self.base = ""
         self.frames: dict[str, GnssFrame | OtherFrame] = {}
         self._poses = poses
@@ -259,7 +262,7 @@ class RecordDecoder:
         sigma (None if unknown).
 
         Args:
-            message: PointCloud2, LaserScan, CustomMsg, or packets of Velodyne or Hesai.
+            message: PointCloud2, LaserScan, CustomMsg, or the packets of a sweep.
             stamp_ns: Time of the scan [ns].
             losses: Dict from reasons to numbers; the number of packets that are not data packets is added in
                 place.
@@ -277,21 +280,28 @@ class RecordDecoder:
             return self._timed_scan(message, frame, columns, stamp_ns, losses), frame, None
         decoded = self.message(message)
         frame, shift = frame_name(decoded.header.frame_id), stamp_ns - _time_ns(decoded.header.stamp)
-        of_hesai = msgtype in hesai.SCAN_TYPES
+        decoder = self._decoder_of(msgtype)
         packets = [
-            (_time_ns(p.stamp) + shift, (p.data[: p.size] if of_hesai else p.data).tobytes())
-            for p in decoded.packets
+            (_time_ns(p.stamp) + shift, p.data[: getattr(p, "size", None)].tobytes()) for p in decoded.packets
         ]
-        good = [each for each in packets if (hesai.model_of if of_hesai else is_data_packet)(each[1])]
-        if of_hesai and packets and not good:
-            hesai.refuse(packets[0][1])
+        good = [each for each in packets if decoder.is_data(each[1])]
+        if packets and not good:
+            decoder.refuse(packets[0][1])
         if len(good) < len(packets):
             count_loss(losses, "packets that are no data packets", len(packets) - len(good))
         times, data = [stamp for stamp, _ in good], [packet for _, packet in good]
-        if of_hesai:
-            scan, model = hesai.decode_hesai(stamp_ns, times, data)
-            return scan, frame, model.sensor
-        return self._packets.decode(stamp_ns, times, data), frame, SENSORS[data[0][-1]]
+        scan, sensor = decoder.decode(stamp_ns, times, data)
+        return scan, frame, sensor
+
+    def _decoder_of(self, msgtype: str) -> SweepDecoder:
+        """Return the decoder of messages of packets; SourceError if there is none for this type."""
+        if msgtype not in self._decoders:
+            found = (kind for kind in packet_formats() if msgtype in kind.msgtypes)
+            kind = next(found, PacketFormat(f"packets of the type {msgtype}", (msgtype,)))
+            if kind.refusal or kind.sweeps is None:
+                raise SourceError(f"{kind.words} need an extension", remedy=kind.refusal)
+            self._decoders[msgtype] = kind.sweeps()
+        return self._decoders[msgtype]
 
     def timed(self, message: Message) -> tuple[str, TimedScan] | None:
         """Return the frame of a cloud and what its times are decided by; None for another type, or a cloud

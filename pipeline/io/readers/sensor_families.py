@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.io.readers.hesai import SCAN_TYPES as HESAI_SCANS
 from pipeline.io.readers.livox import CUSTOM_TYPES
 
 
@@ -65,6 +64,8 @@ VELODYNE = SensorFamily(
     simulated=("vlp16", "vlp32"),
     frames=("velodyne",),
 )
+#: Messages with the packets of a sweep of Hesai.
+HESAI_SCANS = ("pandar_msgs/msg/PandarScan", "hesai_lidar/msg/PandarScan")
 #: Single packets of Ouster, of its LiDAR and its IMU; read with the extra `ouster`.
 OUSTER_PACKETS = (
     "ouster_ros/msg/PacketMsg",

@@ -12,13 +12,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from pipeline.errors import SourceError
+from pipeline.io.readers import packet_formats
 from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.container import TRANSFORM_TYPES, Channel
-from pipeline.io.readers.hesai import PACKET_TEXT
-from pipeline.io.readers.hesai import SCAN_TEXT as HESAI_TEXT
-from pipeline.io.readers.hesai import SCAN_TYPES as HESAI_TYPES
 from pipeline.io.readers.livox import CUSTOM_TEXT, CUSTOM_TYPES, POINT_TEXT
-from pipeline.io.readers.sensor_families import OUSTER, OUSTER_PACKETS, family_of_packets
+from pipeline.io.readers.sensor_families import HESAI_SCANS, OUSTER, OUSTER_PACKETS, family_of_packets
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 VELODYNE_SCAN = "velodyne_msgs/msg/VelodyneScan"
@@ -34,7 +32,7 @@ TRANSFORMS, ROS1_TRANSFORMS = TRANSFORM_TYPES
 READ_TYPES = (
     POINT_CLOUD,
     VELODYNE_SCAN,
-    *HESAI_TYPES,
+    *HESAI_SCANS,
     *CUSTOM_TYPES,
     LASER_SCAN,
     ODOMETRY,
@@ -68,10 +66,10 @@ for _custom in CUSTOM_TYPES:
     _package = _custom.partition("/")[0]
     _EXTRA[f"{_package}/msg/CustomPoint"] = POINT_TEXT
     _EXTRA[_custom] = CUSTOM_TEXT.format(package=_package)
-for _packets in HESAI_TYPES:
+for _packets in HESAI_SCANS:
     _package = _packets.partition("/")[0]
-    _EXTRA[f"{_package}/msg/PandarPacket"] = PACKET_TEXT
-    _EXTRA[_packets] = HESAI_TEXT.format(package=_package)
+    _EXTRA[f"{_package}/msg/PandarPacket"] = "builtin_interfaces/Time stamp\nuint8[1500] data\nuint32 size\n"
+    _EXTRA[_packets] = f"std_msgs/Header header\n{_package}/PandarPacket[] packets\n"
 
 
 def decode(channel: Channel, payload: bytes) -> Any:  # noqa: ANN401
@@ -105,7 +103,7 @@ def standard_types(encoding: str) -> Typestore:
 
 
 #: Packets of a sweep, as they come from the sensor.
-PACKET_TYPES = (VELODYNE_SCAN, *HESAI_TYPES)
+PACKET_TYPES = (VELODYNE_SCAN, *HESAI_SCANS)
 TYPES_BY_ROLE = {
     "scan": (*CUSTOM_TYPES, POINT_CLOUD, *PACKET_TYPES, LASER_SCAN),
     "odometry": (ODOMETRY,),
@@ -268,6 +266,10 @@ def _refuse_packets(topics: list[Topic], where: str) -> None:
     """Raise a SourceError that names maker and driver if a topic has packets that are not decoded; else
     return."""
     for topic in topics:
+        kinds = (kind for kind in packet_formats() if topic.msgtype in kind.msgtypes and kind.refusal)
+        off = next(kinds, None)
+        if off is not None and topic.count:
+            raise SourceError(f"{topic.name} has {off.words}", where=where, remedy=off.refusal)
         family = family_of_packets(topic.msgtype) or (OUSTER if topic.msgtype in OUSTER_PACKETS else None)
         if family is not None and topic.count:  # of Ouster only live: those of a recording are decoded
             raise SourceError(

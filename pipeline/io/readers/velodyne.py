@@ -1,4 +1,4 @@
-"""Velodyne data packets (1206 bytes): decoding of packets into a Scan, for captures, ROS messages and UDP."""
+"""Velodyne data packets (1206 bytes): decoding of packets into a Scan, for ROS messages and UDP."""
 
 from __future__ import annotations
 
@@ -99,9 +99,18 @@ class PacketDecoder:
         """Begin without decoders; each product number gets its own."""
         self._decoders: dict[int, velodyne_decoder.ScanDecoder] = {}
 
-    def decode(self, stamp_ns: int, stamps_ns: Sequence[int], packets: Sequence[bytes]) -> Scan:
-        """Return the scan of the packets of one sweep, which may have no points; each packet must pass
-        `is_data_packet`, and all are of one sensor.
+    def is_data(self, packet: bytes) -> bool:
+        """Return whether the bytes are a data packet of a known sensor."""
+        return is_data_packet(packet)
+
+    def refuse(self, packet: bytes) -> None:
+        """Return: models that cannot be decoded are not known by their packets."""
+
+    def decode(
+        self, stamp_ns: int, stamps_ns: Sequence[int], packets: Sequence[bytes]
+    ) -> tuple[Scan, Sensor]:
+        """Return the scan of the packets of one sweep, which may have no points, and the sensor except for
+        its range sigma; each packet must pass `is_data_packet`, and all are of one sensor.
 
         Args:
             stamp_ns: Stamp of the scan [ns].
@@ -124,7 +133,7 @@ class PacketDecoder:
             _stamp, table = self._decoder_of(packets[0][PRODUCT]).decode(vector, True)
         except Exception as error:  # the decoder raises whatever its C++ library throws
             raise PacketError(str(error)) from error
-        return self._scan(stamp_ns, stamps_ns[-1] - stamp_ns, table)
+        return self._scan(stamp_ns, stamps_ns[-1] - stamp_ns, table), SENSORS[packets[0][PRODUCT]]
 
     def _decoder_of(self, product: int) -> velodyne_decoder.ScanDecoder:
         """Return the decoder of a product number; it finds the model itself, except for VLP-32."""

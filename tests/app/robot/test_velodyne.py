@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.extensions.formats.capture import find_packets
 from app.robot.link import SKIPPED
 from app.robot.velodyne import NO_DATA, OTHERS, Sweeps
 from pipeline.io.readers import SourceOptions, open_source
-from pipeline.io.readers.capture import find_packets
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import ArrivalReader
 from pipeline.io.readers.topics import VELODYNE_SCAN, standard_types

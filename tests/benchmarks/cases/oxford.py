@@ -75,10 +75,10 @@ def mapped_folder(
 
     import numpy as np
 
+    from app.extensions.formats.tree_manager import TRAJECTORY, trajectory_text
     from pipeline.config import preset
     from pipeline.evaluation import path_error
     from pipeline.io.readers import open_source
-    from pipeline.io.readers.tree_manager import TRAJECTORY, trajectory_text
     from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import steps
     from tests.benchmarks.tree_manager_folder import perturbed

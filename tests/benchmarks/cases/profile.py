@@ -96,7 +96,7 @@ def _drives(folder: Path) -> Iterator[tuple[str, str]]:
     """Yield name and URI of each drive; recordings without odometry get one that drifts."""
     import numpy as np
 
-    from pipeline.io.readers.tree_manager import TRAJECTORY, trajectory_text
+    from app.extensions.formats.tree_manager import TRAJECTORY, trajectory_text
     from tests.benchmarks.cases.oxford import BIAS, DISTANCE, TURN
     from tests.benchmarks.tree_manager_folder import perturbed, read_recorded, write_states
 

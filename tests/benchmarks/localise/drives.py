@@ -10,10 +10,10 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 
+from app.extensions.formats.tree_manager import STEM_FINDER
 from app.extensions.maps.localisation import StoredMap
 from pipeline.config import preset
 from pipeline.geometry.poses import Float, Pose2, Pose3
-from pipeline.io.readers.tree_manager import STEM_FINDER
 from pipeline.loop_closure.stem_matching import aligned
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps

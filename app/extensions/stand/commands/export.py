@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from app.cli.export import CLOUD_SUFFIXES, TREE_MANAGER, print_written
+from app.cli.export import CLOUD_SUFFIXES, print_written
 from app.cli.stored import reviewed
 from app.extensions.stand.commands.flags import (
     add_plot_flags,
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     print its files; existing ones are replaced.
 
     Returns:
-        0; None for the files of Tree Manager and of the cloud, which the program writes.
+        0; None for the file of the cloud, which the program writes.
 
     Raises:
         StemmapError: A flag is wrong, the run cannot be read or lacks what the format shows, or a package is
@@ -41,9 +41,9 @@ def run(arguments: argparse.Namespace) -> int | None:
     from app.extensions.stand.gis_files import WRITERS, read_with_plots
     from app.extensions.stand.run_figures import stand_of
 
-    file = Path(arguments.to)
-    if arguments.to == TREE_MANAGER or file.suffix.lower() in CLOUD_SUFFIXES or arguments.out is not None:
+    if arguments.to is None or Path(arguments.to).suffix.lower() in CLOUD_SUFFIXES:
         return None
+    file = Path(arguments.to)
     with reviewed(arguments.run) as folder:
         plots, parameters = chosen_plots(arguments), stand_parameters(arguments)
         exported = read_with_plots(folder, stand_of(folder, parameters, plots) if plots else None)

@@ -10,10 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import SourceError
-from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import Source, tree_manager
-from pipeline.io.readers.tree_manager import (
+from app.extensions.formats import tree_manager
+from app.extensions.formats.tree_manager import (
     COLUMNS,
     _numbers,
     state_name,
@@ -21,6 +19,9 @@ from pipeline.io.readers.tree_manager import (
     trajectory_text,
     write_tree_manager,
 )
+from pipeline.errors import SourceError
+from pipeline.geometry.poses import Pose3
+from pipeline.io.readers import Source
 from pipeline.types.records import Odometry, Scan, Stems
 from pipeline.types.records import Path as MapPath
 from tests.app import fakes

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from app.extensions.formats.hesai import ONE_SURFACE
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import SourceOptions, count_loss
 from pipeline.io.readers.container import TRANSFORM_TYPES, Channel, Container, Message
-from pipeline.io.readers.hesai import ONE_SURFACE
 from pipeline.io.readers.sensor_families import OUSTER, OUSTER_PACKETS
 from pipeline.io.readers.topics import IMU, POINT_CLOUD, TRANSFORMS, TYPES_BY_ROLE, decode, standard_types
 from pipeline.types.records import Bool, Int

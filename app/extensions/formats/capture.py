@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from app.extensions.formats import hesai, ouster
 from pipeline.errors import SourceError
-from pipeline.io.readers import hesai, ouster, velodyne
+from pipeline.io.readers import velodyne
 from pipeline.io.readers.base import (
     FileSource,
     Source,
@@ -23,6 +24,7 @@ from pipeline.io.readers.base import (
 )
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.mounting import assumed_mounting
+from pipeline.io.readers.packets import SweepDecoder
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.scan_columns import sensor_of
 from pipeline.io.readers.sensor_families import FAMILIES, OUSTER, OUSTER_PACKETS, ROBOSENSE, SensorFamily
@@ -229,17 +231,14 @@ class PcapSource(FileSource):
             SourceError: The file cannot be read any more.
         """
         self._losses = losses = dict[str, int]()
-        decoder, of_hesai = velodyne.PacketDecoder(), int(self._packets["product"][0]) >= _HESAI
+        of_hesai = int(self._packets["product"][0]) >= _HESAI
+        decoder: SweepDecoder = hesai.PacketDecoder() if of_hesai else velodyne.PacketDecoder()
         for sweep in range(len(self._first)):
             rows = range(int(self._first[sweep]), int(self._last[sweep]) + 1)
             stamps = self._packets["stamp_ns"][rows.start : rows.stop].tolist()
             stamp_ns, packets = int(self._stamp[sweep]), self._read(rows)
             try:
-                scan = (
-                    hesai.decode_hesai(stamp_ns, stamps, packets)[0]
-                    if of_hesai
-                    else decoder.decode(stamp_ns, stamps, packets)
-                )
+                scan, _ = decoder.decode(stamp_ns, stamps, packets)
             except (velodyne.PacketError, hesai.HesaiPacketError):
                 count_loss(losses, "scans that cannot be decoded")
                 continue

@@ -12,16 +12,17 @@ import pytest
 import velodyne_decoder
 from scipy.spatial import cKDTree
 
+from app.extensions.formats.capture import find_packets
+from app.extensions.formats.hesai import MODELS, HesaiModel
 from pipeline.errors import SourceError
-from pipeline.io.readers.capture import find_packets
-from pipeline.io.readers.hesai import MODELS, SCAN_TYPES, HesaiModel
 from pipeline.io.readers.point_files import open_table, read_columns
+from pipeline.io.readers.sensor_families import HESAI_SCANS
 from pipeline.io.readers.topics import standard_types
 from pipeline.io.readers.velodyne import SENSORS, is_data_packet
 from pipeline.types.records import Scan
+from tests.app.extensions.formats.test_hesai import decoded, turn
 from tests.app.robot.test_velodyne import packet
 from tests.pipeline.io.conftest import Opened
-from tests.pipeline.io.test_hesai import decoded, turn
 
 
 def frames(capture: bytes) -> list[tuple[int, int, bytes]]:
@@ -212,7 +213,7 @@ def test_a_real_recording_of_hesai_as_a_capture_has_the_same_scans(
     store = standard_types("cdr")
     frames_of_packets = []
     for (payload,) in database.execute("select data from messages order by timestamp"):
-        for each in store.deserialize_cdr(payload, SCAN_TYPES[0]).packets:  # type: ignore[attr-defined]
+        for each in store.deserialize_cdr(payload, HESAI_SCANS[0]).packets:  # type: ignore[attr-defined]
             content = each.data[: each.size].tobytes()
             frames_of_packets.append((each.stamp.sec, each.stamp.nanosec // 1000, udp(content)))
     database.close()

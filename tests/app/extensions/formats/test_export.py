@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from app.batch.run_folder import read_run
+from app.extensions.formats.tree_manager import write_tree_manager
 from pipeline.errors import StemmapError
-from pipeline.io.readers.tree_manager import write_tree_manager
 from tests.app.cli.test_commands import stemmap
 
 RUN = "sim:stand?duration=12"

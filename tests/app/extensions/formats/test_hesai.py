@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial import cKDTree
 
+from app.extensions.formats.hesai import MODELS, HesaiModel, decode_hesai, model_of
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
-from pipeline.io.readers.hesai import MODELS, SCAN_TYPES, HesaiModel, decode_hesai, model_of
 from pipeline.io.readers.point_files import open_table, read_columns
+from pipeline.io.readers.sensor_families import HESAI_SCANS
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, Author, Write, write_recording
@@ -163,7 +164,7 @@ def scans_of(source: Source) -> list[Scan]:
 
 
 @by_model
-@pytest.mark.parametrize(("container", "kind"), [("bag", SCAN_TYPES[1]), ("mcap", SCAN_TYPES[0])])
+@pytest.mark.parametrize(("container", "kind"), [("bag", HESAI_SCANS[1]), ("mcap", HESAI_SCANS[0])])
 def test_packets_in_a_recording_are_scans_with_rings_from_below(
     container: str, kind: str, model: HesaiModel, tmp_path: Path, opened: Opened
 ):
@@ -186,7 +187,7 @@ def test_packets_in_a_recording_are_scans_with_rings_from_below(
 def test_damaged_packets_are_counted(tmp_path: Path, opened: Opened):
     packets = turn(MODELS[0])
     packets[3] = packets[3][:600]
-    source = opened(write_recording("db3", tmp_path, fill_with(SCAN_TYPES[0], packets)))
+    source = opened(write_recording("db3", tmp_path, fill_with(HESAI_SCANS[0], packets)))
     assert len(scans_of(source)) == 3
     assert source.losses == {"packets that are no data packets": 3}
 
@@ -204,7 +205,7 @@ def test_a_model_without_a_table_is_refused_with_its_driver(
 ):
     made = bytes([0xEE, 0xFF, *head]) + bytes(1100)
     with pytest.raises(SourceError, match=name) as caught:
-        opened(write_recording("mcap", tmp_path, fill_with(SCAN_TYPES[0], [made] * 9)))
+        opened(write_recording("mcap", tmp_path, fill_with(HESAI_SCANS[0], [made] * 9)))
     assert "hesai_ros_driver" in str(caught.value.remedy)
     assert "/pandar_packets" in str(caught.value.where)
 

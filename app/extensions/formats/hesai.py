@@ -12,10 +12,6 @@ from pipeline.errors import SourceError
 from pipeline.io.readers.scan_columns import clean_scan
 from pipeline.types.records import Bool, Float, Int, Scan, Sensor
 
-#: Messages of a sweep of packets: a header, and packets of stamp, 1500 bytes and the number of valid bytes.
-SCAN_TYPES = ("pandar_msgs/msg/PandarScan", "hesai_lidar/msg/PandarScan")
-PACKET_TEXT = "builtin_interfaces/Time stamp\nuint8[1500] data\nuint32 size\n"
-SCAN_TEXT = "std_msgs/Header header\n{package}/PandarPacket[] packets\n"
 _TURN = 36_000  # 0.01 degrees
 #: Number of echoes of a shot by the return mode, in as many blocks of one azimuth; other modes have one.
 _ECHOES = {0x39: 2, 0x3A: 2, 0x3B: 2, 0x3C: 2, 0x3D: 3}
@@ -244,6 +240,25 @@ def decode_hesai(
         offset_ns=np.clip(offset, -2e9, 2e9)[row],
     )
     return scan, model
+
+
+class PacketDecoder:
+    """Decodes the packets of one sensor, one sweep at a time, see `pipeline.io.readers.packets`."""
+
+    def is_data(self, packet: bytes) -> bool:
+        """Return whether the bytes are a data packet of a known model."""
+        return model_of(packet) is not None
+
+    def refuse(self, packet: bytes) -> None:
+        """Raise a SourceError that names the model, see `refuse`."""
+        refuse(packet)
+
+    def decode(
+        self, stamp_ns: int, stamps_ns: Sequence[int], packets: Sequence[bytes]
+    ) -> tuple[Scan, Sensor]:
+        """Return the scan and the sensor, see `decode_hesai`."""
+        scan, model = decode_hesai(stamp_ns, stamps_ns, packets)
+        return scan, model.sensor
 
 
 def _echoes_to_keep(reach: Float, azimuth: Int, echoes: int) -> Bool:
