@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipeline.config import Parameters
 
 SOURCE_HELP = (
-    "a recording (.mcap, .db3, .bag, .pcap), a folder of scans (.bin, .pcd, .ply, "
+    "a recording (.mcap, .db3, .bag), a folder of scans (.bin, .pcd, .ply, "
     ".npy, .npz, .las, .laz), "
     "a whole cloud (.laz, .las, .e57, .ply, .npy, .npz), "
     "a live robot (zenoh:tcp/host:7447, velodyne:ADDRESS:PORT?from=SENSOR), "

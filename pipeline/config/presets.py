@@ -122,7 +122,7 @@ PRESETS: dict[str, tuple[str, dict[str, object]]] = {
         "The paper's text: eccentricity between 10 and 20",
         {**_PAPER, "detection.e_min": 10.0},
     ),
-    "stems": ("Stems detected by another program, as in a folder of TreeManagerState files", _STEMS),
+    "stems": ("Stems detected by another program", _STEMS),
     "laser2d": ("A planar laser, as on a car", _LASER2D),
 }
 

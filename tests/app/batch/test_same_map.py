@@ -12,8 +12,8 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from app.batch.map_run import OfflineRun, map_run
+from app.sources.opening import open_source
 from pipeline.config import preset
-from pipeline.io.readers import open_source
 from pipeline.simulation.run import SimulatedRun
 from pipeline.types.records import Float
 from tests.pipeline.io.recordings import POINT, START_NS, Author, Write, write_recording

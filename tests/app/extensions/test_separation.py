@@ -27,7 +27,7 @@ WORDS = {
     "cluster": r"\bdask|many_runs|map_runs",
     "dds": r"\bdds:|DdsLink|cyclone|plain DDS|fast_?dds",
     "fleet": r"fleet|robots-link|common.map",
-    "formats": r"victoria",
+    "formats": r"victoria|tree.?manager|\bcapture (file|of packets)|extensions\.formats",
     "maps": r"--continue|ContinuedMap|continue_map|merge_runs|stemmap merge|merged_map|stemmap localise|"
     r"/api/localise|\"localise\"|Locate in",
     "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
@@ -144,10 +144,16 @@ def test_what_needs_an_extension_that_is_switched_off_says_which(monkeypatch, tm
     monkeypatch.setenv(VARIABLE, "")
     cloud = tmp_path / "plot.xyz"
     cloud.write_text("1 2 3\n4 5 6\n7 8 9\n")
-    for extension, words in {
-        "dds": ("serve", "dds:?domain=0", "--no-browser"),
-        "clouds": ("map", cloud, "--as", "cloud", "--out", tmp_path / "out"),
-        "stand": ("stand", tmp_path),
-    }.items():
+    capture = tmp_path / "run.pcap"
+    capture.write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(100))
+    (tmp_path / "stems").mkdir()
+    (tmp_path / "stems" / "TreeManagerState_0.csv").touch()
+    for extension, words in (
+        ("dds", ("serve", "dds:?domain=0", "--no-browser")),
+        ("clouds", ("map", cloud, "--as", "cloud", "--out", tmp_path / "out")),
+        ("formats", ("map", capture, "--out", tmp_path / "out")),
+        ("formats", ("map", tmp_path / "stems", "--out", tmp_path / "out")),
+        ("stand", ("stand", tmp_path)),
+    ):
         assert main([str(word) for word in words]) in (1, WRONG_USAGE)
         assert f"extension {extension} is switched off by STEMMAP_EXTENSIONS" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import get_types_from_msg
 from scipy.spatial import cKDTree
 
+from app.extension import VARIABLE
 from app.extensions.formats.hesai import MODELS, HesaiModel, decode_hesai, model_of
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
@@ -244,3 +245,11 @@ def test_a_real_recording_agrees_with_the_cloud_of_its_makers(folder: str, share
     rms, share = min(found)
     assert rms < 0.005
     assert share == pytest.approx(1.0, abs=0.001)
+
+
+def test_packets_in_a_recording_need_the_extension(
+    tmp_path: Path, opened: Opened, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv(VARIABLE, "")
+    with pytest.raises(SourceError, match="The extension formats is switched off"):
+        opened(write_recording("mcap", tmp_path, fill_with(HESAI_SCANS[0], turn(MODELS[0]))))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 import struct
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,15 +16,21 @@ from scipy.spatial import cKDTree
 
 from app.extensions.formats.capture import find_packets
 from app.extensions.formats.hesai import MODELS, HesaiModel
+from app.robot.velodyne import Sweeps
 from pipeline.errors import SourceError
+from pipeline.io.readers import SourceOptions, open_source
+from pipeline.io.readers.container import Channel, Message
+from pipeline.io.readers.live import ArrivalReader
 from pipeline.io.readers.point_files import open_table, read_columns
 from pipeline.io.readers.sensor_families import HESAI_SCANS
-from pipeline.io.readers.topics import standard_types
-from pipeline.io.readers.velodyne import SENSORS, is_data_packet
-from pipeline.types.records import Scan
+from pipeline.io.readers.topics import VELODYNE_SCAN, standard_types
+from pipeline.io.readers.velodyne import PACKET_BYTES, SENSORS, is_data_packet
+from pipeline.types.records import Record, Scan
 from tests.app.extensions.formats.test_hesai import decoded, turn
 from tests.app.robot.test_velodyne import packet
 from tests.pipeline.io.conftest import Opened
+from tests.pipeline.io.test_mounting import mounted
+from tests.pipeline.io.velodyne_drive import open_drive, packets_of, write_capture
 
 
 def frames(capture: bytes) -> list[tuple[int, int, bytes]]:
@@ -257,3 +265,67 @@ def test_packets_of_another_maker_beside_those_of_the_lidar_are_counted(
     source = opened(path)
     assert source.description.sensor.name == "VLP-16"
     assert source.losses == {"packets of Ouster": 20}
+
+
+def test_contents_decide_before_the_name(shared_data: Path, tmp_path: Path):
+    mislabelled = tmp_path / "capture.bag"
+    shutil.copyfile(shared_data / "velodyne" / "vlp16.pcap", mislabelled)
+    source = open_source(str(mislabelled))
+    assert source.description.kind == "Velodyne capture (pcap)"
+    source.close()
+
+
+def test_a_newer_capture_is_told_how_to_convert(tmp_path: Path):
+    path = tmp_path / "capture.pcap"
+    path.write_bytes(b"\x0a\x0d\x0d\x0a" + bytes(100))
+    with pytest.raises(SourceError, match="editcap"):
+        open_source(str(path))
+
+
+def test_a_packet_of_4_gb_is_refused(tmp_path: Path, opened: Opened):
+    path = tmp_path / "long.pcap"
+    path.write_bytes(struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1) + b"\xff" * 64)
+    with pytest.raises(SourceError):
+        opened(path)
+
+
+def test_a_tilted_sensor_is_levelled(tmp_path: Path, opened: Opened):
+    true = mounted(0, 45)
+    run = open_drive("sim:stand?duration=2", 0.02, true)
+    write_capture(tmp_path / "drive.pcap", [packets_of(run, k) for k in range(2)])
+    described = opened(tmp_path / "drive.pcap").description
+    assert np.degrees(np.arccos(described.T_base_lidar.R[2] @ true.R[2])) < 6.0
+    assert any("tilted by 4" in warning for warning in described.warnings)
+    chosen = SourceOptions(T_base_lidar=mounted(0, 10))
+    assert opened(tmp_path / "drive.pcap", chosen).description.T_base_lidar == chosen.T_base_lidar
+
+
+@pytest.mark.parametrize("name", ["a.pcap", "a.zip"])
+def test_foreign_contents_under_a_known_name_are_refused(name: str, tmp_path: Path, opened: Opened):
+    (tmp_path / name).write_bytes(b"<html><body>404 not found</body></html>" * 50)
+    with pytest.raises(SourceError, match="not those of a"):
+        opened(tmp_path / name)
+
+
+def test_packets_as_they_come_give_the_scans_of_their_capture(shared_data: Path):
+    capture = shared_data / "velodyne" / "vlp16.pcap"
+    packets, _ = find_packets(capture)
+    content = capture.read_bytes()
+    sweeps, messages = Sweeps(), []
+    for offset, stamp_ns in zip(packets["offset"].tolist(), packets["stamp_ns"].tolist(), strict=True):
+        messages.append(sweeps.add(stamp_ns, content[offset : offset + PACKET_BYTES]))
+    messages.append(sweeps.end())
+    reader = ArrivalReader("here", "live", [Channel(1, "/p", VELODYNE_SCAN, "cdr")], SourceOptions())
+    records: list[Record] = []
+    for k, message in enumerate(m for m in messages if m is not None):
+        records += reader.add(Message(1, int(packets["stamp_ns"][0]) + k, message))
+    records += reader.finish()
+    ours = [record for record in records if isinstance(record, Scan)]
+    with closing(open_source(str(capture))) as source:
+        theirs = [record for record in source.records() if isinstance(record, Scan)]
+    assert [scan.stamp_ns for scan in ours] == [scan.stamp_ns for scan in theirs]
+    for mine, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(mine.points, other.points)
+        np.testing.assert_array_equal(mine.ring, other.ring)
+    assert reader.description is not None
+    assert reader.description.sensor.name == "VLP-16"

@@ -225,7 +225,6 @@ def test_the_terrain_is_a_raster_in_its_place(runs, tmp_path, capsys, name):
     [
         ("trees.kml", 1, ".gpkg, .shp"),
         ("missing/trees.gpkg", 1, "cannot read or write"),
-        ("tree-manager", 2, "--out"),
     ],
 )
 def test_what_cannot_be_written_is_refused(runs, capsys, tmp_path, monkeypatch, to, code, message):
