@@ -37,6 +37,7 @@ from pipeline.io.readers import (
     SourceOptions,
     add_formats,
     check_existence,
+    format_of_address,
     path_of,
     points_format,
 )
@@ -204,7 +205,8 @@ def check_address(uri: str) -> bool:
     if is_live(uri):
         parse_address(uri)
     elif uri.startswith(SCHEME) and not Path(uri).exists():
-        parse_uri(uri)
+        if format_of_address(uri) is None:
+            parse_uri(uri)
     else:
         check_existence(uri)
         return True

@@ -222,8 +222,7 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def scenarios() -> dict[str, str]:
-    """Return a dict from the URI of each scenario, e.g. "sim:stand", to its description; runs through clouds
-    are not included."""
+    """Return a dict from the URI of each scenario, e.g. "sim:stand", to its description."""
     return {f"sim:{name}": scenario.line for name, scenario in SCENARIOS.items()}
 
 
@@ -260,10 +259,10 @@ QUALITIES = {
 
 SCHEME = "sim:"
 EXACT = "exact"
-CLOUD = "cloud"
+Options = dict[str, tuple[Any, str]]
 #: Options of a run: type with bounds, and meaning. Times and sizes are decimal numbers without a sign.
 LIDAR_NAMES = ("vlp16", "vlp32", "os0-128", "os1-64", "xt32", "helios", "mid360", "avia", "solid")
-_OPTIONS: dict[str, tuple[Any, str]] = {
+OPTIONS: Options = {
     "seed": (Annotated[int, Meta(ge=0, le=2**63 - 1)], "0 to 2^63 - 1"),
     "sigma": (Annotated[float, Meta(ge=0.0, le=0.2)], "range noise in metres, 0 to 0.2"),
     "odometry": (str, f"one of {', '.join([*QUALITIES, EXACT])}"),
@@ -271,12 +270,8 @@ _OPTIONS: dict[str, tuple[Any, str]] = {
     "trees": (Annotated[int, Meta(ge=0, le=2000)], "how many, 0 to 2000"),
     "drive": (Annotated[int, Meta(ge=0, le=1000)], "another drive through the same scene, 0 to 1000"),
     "lidar": (str, f"one of {', '.join(LIDAR_NAMES)}"),
-    "file": (str, "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd"),
-    "truth": (str, "a table (CSV) of its trees in the coordinates of the cloud"),
 }
 _NUMBER = re.compile(r"[-+.0-9eE]+")
-_KEYS = ("seed", "sigma", "odometry", "duration", "trees", "drive", "lidar")
-_CLOUD_KEYS = ("file", "truth", "seed", "sigma", "odometry", "duration")
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,10 +283,9 @@ class RunRequest:
         seed: Random seed of the run.
         sigma: Standard deviation of a range [m].
         odometry: Quality of the wheels, or "exact".
-        duration_s: Duration [s]; 0 for one loop of a run through a cloud.
-        trees: Number of trees; 0 for a run through a cloud.
+        duration_s: Duration [s].
+        trees: Number of trees.
         drive: Number of the drive; other drives through the same scene have other noise.
-        file, truth: Cloud of a run through a real plot and table of its trees, or empty.
         lidar: Name of the sensor, one of LIDAR_NAMES; "" for that of the scenario.
     """
 
@@ -302,14 +296,11 @@ class RunRequest:
     duration_s: float
     trees: int
     drive: int = field(default=0, repr=False)
-    file: str = ""
-    truth: str = ""
     lidar: str = field(default="", repr=False)
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario with the requested number of trees. KeyError for a run through a cloud, which has
-        none."""
+        """The scenario with the requested number of trees; KeyError for another name."""
         return replace(SCENARIOS[self.name], trees=self.trees)
 
 
@@ -317,9 +308,8 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
     """Return the request of `sim:NAME?key=value&...`; "sim:" may be omitted. Options that are missing have
     the defaults of the scenario.
 
-    The duration of a run through a cloud is 0 in the request, for one loop, if the URI has none; a duration
-    in the URI is 1 s to 3600 s. A scenario with placed objects has at most its default number of trees, the
-    others have at most 2000. Files are not opened.
+    The duration is 1 s to 3600 s. A scenario with placed objects has at most its default number of trees, the
+    others have at most 2000.
 
     Args:
         uri: As the user wrote it; the part after "?" is percent-encoded.
@@ -327,55 +317,45 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
 
     Raises:
         UsageError: No such scenario, key, odometry or LiDAR; a key twice; a part after "?" that is not pairs;
-            a value that is not a number or out of bounds; or a run through a cloud without a file.
+            or a value that is not a number or out of bounds.
     """
     name, _, query = uri.removeprefix(SCHEME).partition("?")
-    if name != CLOUD and name not in SCENARIOS:
+    if name not in SCENARIOS:
         known = ", ".join(SCHEME + scenario for scenario in SCENARIOS)
         raise UsageError(f"there is no scenario {name!r}", where=uri, remedy=f"Scenarios: {known}")
-    scenario = None if name == CLOUD else SCENARIOS[name]
-    values = _values(uri, query, _KEYS if scenario else _CLOUD_KEYS)
-    if scenario is None and not values.get("file"):
-        raise UsageError(
-            "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
-        )
-    odometry = values.get("odometry", scenario.odometry if scenario else "normal")
-    if odometry not in (*QUALITIES, EXACT):
-        raise _refusal(uri, "odometry", odometry)
-    if values.get("lidar", LIDAR_NAMES[0]) not in LIDAR_NAMES:
-        raise _refusal(uri, "lidar", values["lidar"])
-    trees = values.get("trees", scenario.trees if scenario else 0)
-    if scenario and scenario.placed and trees > scenario.trees:
+    scenario = SCENARIOS[name]
+    values = option_values(uri, query, OPTIONS)
+    values.setdefault("seed", seed)
+    trees = values.get("trees", scenario.trees)
+    if scenario.placed and trees > scenario.trees:
         remedy = f"This scenario has at most {scenario.trees} trees"
-        raise UsageError(_refusal(uri, "trees", str(trees)).what, where=uri, remedy=remedy)
+        raise UsageError(_refusal(uri, "trees", str(trees), OPTIONS).what, where=uri, remedy=remedy)
     return RunRequest(
         name=name,
-        seed=values["seed"] if "seed" in values else _value(uri, "seed", str(seed)),
+        seed=_value(uri, "seed", str(values["seed"]), OPTIONS),
         sigma=values.get("sigma", 0.02),
-        odometry=odometry,
-        duration_s=values.get("duration", scenario.duration_s if scenario else 0.0),
+        odometry=values.get("odometry", scenario.odometry),
+        duration_s=values.get("duration", scenario.duration_s),
         trees=trees,
         drive=values.get("drive", 0),
-        file=values.get("file", ""),
-        truth=values.get("truth", ""),
         lidar=values.get("lidar", ""),
     )
 
 
-def _values(uri: str, query: str, keys: tuple[str, ...]) -> dict[str, Any]:
-    """Return a dict from the keys to the values of the options of a URI, with the types of _OPTIONS; empty
-    for an empty query. In texts "+" is a space; they may be empty.
+def option_values(uri: str, query: str, options: Options) -> dict[str, Any]:
+    """Return a dict from the keys to the values of the options of a URI; empty for an empty query. In texts
+    "+" is a space; they may be empty.
 
     Args:
         uri: The URI, for errors.
         query: Part of the URI after "?", percent-encoded.
-        keys: Valid keys.
+        options: Valid options.
 
     Raises:
         UsageError: The query is not key=value pairs, a key is unknown or given twice, or a value has another
             type or is out of bounds.
     """
-    allowed = "Options: " + "; ".join(f"{key} ({_OPTIONS[key][1]})" for key in keys)
+    allowed = "Options: " + "; ".join(f"{key} ({words})" for key, (_, words) in options.items())
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
     except ValueError:
@@ -384,33 +364,38 @@ def _values(uri: str, query: str, keys: tuple[str, ...]) -> dict[str, Any]:
         ) from None
     values: dict[str, Any] = {}
     for key, text in pairs:
-        if key not in keys:
+        if key not in options:
             raise UsageError(f"a simulated run has no option {key!r}", where=uri, remedy=allowed)
         if key in values:
             raise UsageError(f"option {key!r} is given twice", where=uri, remedy="Give it once")
-        values[key] = _value(uri, key, text)
+        values[key] = _value(uri, key, text, options)
+    if values.get("odometry", EXACT) not in (*QUALITIES, EXACT):
+        raise _refusal(uri, "odometry", values["odometry"], options)
+    if values.get("lidar", LIDAR_NAMES[0]) not in LIDAR_NAMES:
+        raise _refusal(uri, "lidar", values["lidar"], options)
     return values
 
 
-def _value(uri: str, key: str, text: str) -> Any:  # noqa: ANN401 - of the type of the option
+def _value(uri: str, key: str, text: str, options: Options) -> Any:  # noqa: ANN401 - of the type of the option
     """Return the value of an option; UsageError if the text has another type or is out of bounds."""
-    declared = _OPTIONS[key][0]
+    declared = options[key][0]
     kind = getattr(declared, "__origin__", str)
     # Python alone would also take 1_0, spaces and digits of other scripts.
     if kind is not str and not _NUMBER.fullmatch(text):
-        raise _refusal(uri, key, text)
+        raise _refusal(uri, key, text, options)
     try:
         return msgspec.convert(kind(text), declared)
     except (ValueError, msgspec.ValidationError):
-        raise _refusal(uri, key, text) from None
+        raise _refusal(uri, key, text, options) from None
 
 
-def _refusal(uri: str, key: str, text: str) -> UsageError:
+def _refusal(uri: str, key: str, text: str, options: Options) -> UsageError:
     """Return the error for an option whose value is not valid.
 
     Args:
         uri: The URI, for the message.
         key: Name of the option.
         text: Value of the option.
+        options: Valid options.
     """
-    return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_OPTIONS[key][1]}")
+    return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {options[key][1]}")

@@ -3,7 +3,28 @@ scanner measures it."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from app.extension import Extension, page_folder
+
+if TYPE_CHECKING:
+    from pipeline.io.readers import Format, Source, SourceOptions
+
+
+def _open_drive(uri: str, path: Path, options: SourceOptions) -> Source:
+    """Open a simulated drive through a cloud."""
+    from app.extensions.clouds.cloud_drive import open_drive
+
+    return open_drive(uri, path, options)
+
+
+def _formats() -> tuple[Format, ...]:
+    """Return the simulated drive through a cloud, by its address and for clouds that are opened as runs."""
+    from pipeline.io.readers import Format
+
+    return (Format("a whole cloud", (), (), _open_drive, scheme="sim:cloud", scans_clouds=True),)
+
 
 EXTENSION = Extension(
     help="whole clouds (.laz, .las, .e57, ...): their stems, diameters and heights, mapped without a drive",
@@ -11,6 +32,7 @@ EXTENSION = Extension(
         "map": "app.extensions.clouds.map_command",
         "info": "app.extensions.clouds.info_command",
     },
+    formats=_formats,
     sources="app.extensions.clouds.sources",
     page=page_folder("clouds"),
 )

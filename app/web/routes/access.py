@@ -181,7 +181,7 @@ def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
         settings: Settings of the deployment, with the data folders.
         any_file: Whether the request may open every source, also files outside of the data folders and live
             robots; then the URI is returned as it is. Otherwise only files in the data folders and simulated
-            runs may be opened, a scanned cloud (`sim:cloud`) only if its files `file` and `truth` are in the
+            runs may be opened, those with the files `file` and `truth` only if these are in the
             data folders. The names of all these files are replaced by absolute paths without links, so that
             the file that was checked is the file that is opened.
     """
@@ -204,12 +204,9 @@ def _permitted_path(name: str, settings: Settings) -> str | None:
 
 
 def _permitted_simulation(uri: str, settings: Settings) -> str | None:
-    """Return the address of a simulated run. For a scan of a cloud, its files are replaced by their permitted
-    paths; None if one is not permitted; errors as `_permitted_path`. Other scenarios are permitted as they
-    are."""
-    name, _, query = uri.removeprefix("sim:").partition("?")
-    if name != "cloud":
-        return uri
+    """Return the address of a simulated run with its files replaced by their permitted paths; None if one is
+    not permitted; errors as `_permitted_path`. An address without files is permitted as it is."""
+    beginning, _, query = uri.partition("?")
     values = dict(parse_qsl(query, keep_blank_values=True))
     for key in ("file", "truth"):
         if key in values:
@@ -217,7 +214,7 @@ def _permitted_simulation(uri: str, settings: Settings) -> str | None:
             if path is None:
                 return None
             values[key] = path
-    return f"sim:cloud?{urlencode(values)}"
+    return f"{beginning}?{urlencode(values)}" if {"file", "truth"} & values.keys() else uri
 
 
 # --- edits of annotations --------------------------------------------------------------------------

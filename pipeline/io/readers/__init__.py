@@ -84,6 +84,9 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
         SourceError: The scheme is that of a live robot, or the source cannot be opened.
         UsageError: The scheme is unknown, or the scenario or its options are not valid.
     """
+    kind = format_of_address(uri)
+    if kind is not None:
+        return kind.open(uri, Path(), options)
     if scheme == "sim":
         from pipeline.io.readers.simulated import open_simulated
 
@@ -163,7 +166,14 @@ def _opener(module: str, function: str) -> Opener:
 
 _recording = _opener("live", "open_recording")
 _scans = _opener("scan_folder", "ScanFolder")
-_cloud = _opener("simulated", "open_cloud_drive")
+
+
+def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
+    """Open a whole cloud as a run of scans, by the format that does so; SourceError if there is none."""
+    kind = next((kind for kind in formats() if kind.scans_clouds), None)
+    if kind is None:
+        raise SourceError("a whole cloud has no scans", where=uri, remedy="Open it as a scan (--as scan)")
+    return opener_of(kind)(uri, path, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +188,8 @@ class Format:
         is_cloud: Whether it is usually a whole cloud.
         holds_points: Whether it is a file of points: a whole cloud or one scan.
         depends_on_contents: Whether its contents decide which of them, see `cloud_or_scan`.
+        scheme: Beginning of the addresses that it opens, such as "sim:cloud"; "" for none.
+        scans_clouds: Whether it opens whole clouds as runs of scans.
         is_folder: Whether a folder with files of these names is of this format; None for a format of files.
         refusal: Why it cannot be used, as the remedy of an error; "" if it can.
     """
@@ -189,8 +201,20 @@ class Format:
     is_cloud: bool = False
     holds_points: bool = False
     depends_on_contents: bool = False
+    scheme: str = ""
+    scans_clouds: bool = False
     is_folder: Callable[[Collection[str]], bool] | None = None
     refusal: str = ""
+
+
+def format_of_address(uri: str) -> Format | None:
+    """Return the format that opens an address, by its beginning up to "?"; None if there is none. Raises
+    SourceError if it cannot be used."""
+    beginning = uri.partition("?")[0]
+    kind = next((kind for kind in formats() if kind.scheme == beginning), None)
+    if kind is not None and kind.refusal:
+        raise SourceError(f"{kind.words} needs an extension", where=uri, remedy=kind.refusal)
+    return kind
 
 
 def opener_of(kind: Format) -> Opener:
@@ -256,7 +280,7 @@ def readable() -> str:
         "a rosbag2 folder",
         "sim:stand and the other sim: scenarios.",
     )
-    words = (kind.words for kind in formats() if not kind.refusal)
+    words = (kind.words for kind in formats() if not kind.refusal and not kind.scans_clouds)
     return "Supported formats: " + ", ".join([*words, *folders])
 
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
-from urllib.parse import urlencode
 
-from pipeline.errors import SourceError
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions
 from pipeline.simulation.robot_motion import IMU_HZ, ODOMETRY_HZ
 from pipeline.simulation.run import START_NS, SimulatedRun, open_run
-from pipeline.simulation.scenarios import CLOUD, SCHEME, RunRequest, parse_uri
+from pipeline.simulation.scenarios import parse_uri
 from pipeline.types.records import Record, Truth
 
 _TICK_NS = 1_000_000_000 // IMU_HZ
@@ -83,58 +80,12 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
     """Open `sim:NAME?seed=&sigma=&odometry=&duration=&trees=`.
 
     `options.seed` applies when the URI has no seed; `options.T_base_lidar` are the extrinsics of the
-    simulated LiDAR; None uses the default of the simulation. `sim:cloud?file=&truth=` is a drive through the
-    real cloud of a plot.
+    simulated LiDAR; None uses the default of the simulation.
 
     Raises:
         UsageError: There is no such scenario or option, or a value is out of bounds.
-        SourceError: A file cannot be read, there is no free position for an object in the scene, or no path
-            for a robot.
+        SourceError: There is no free position for an object in the scene.
     """
     chosen = SourceOptions() if options is None else options
     request = parse_uri(uri, chosen.seed)
-    if request.name == CLOUD:
-        return _open_cloud(uri, request, chosen)
     return SimulatedSource(uri, open_run(request, chosen.T_base_lidar))
-
-
-def open_cloud_drive(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
-    """Open a whole cloud as a run: a simulated robot drives through it, as for `sim:cloud?file=`.
-
-    Args:
-        uri: Path as the user wrote it.
-        file: File of the cloud.
-        options: Choices of the user, of which seed and extrinsics are used.
-
-    Raises:
-        SourceError: The cloud cannot be read, or has no path for a robot.
-    """
-    request = parse_uri(f"{SCHEME}{CLOUD}?{urlencode({'file': str(file)})}", options.seed)
-    return _open_cloud(uri, request, options)
-
-
-def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> SimulatedSource:
-    """Open a drive through the real cloud of a plot.
-
-    Args:
-        uri: URI as the user wrote it.
-        request: Scenario and options of the URI.
-        options: Choices of the user.
-
-    Raises:
-        SourceError: The cloud or the ground truth cannot be read, or the cloud has no path for a robot.
-    """
-    from pipeline.io.ground_truth import read_truth_trees
-    from pipeline.io.readers.clouds import open_cloud
-    from pipeline.simulation.cloud_run import open_cloud_run
-
-    trees = read_truth_trees(Path(request.truth).expanduser()) if request.truth else None
-    cloud = open_cloud(request.file, options)
-    try:
-        run = open_cloud_run(request, cloud, trees, options.T_base_lidar)
-    except SourceError as error:
-        raise SourceError(
-            error.what, where=uri, remedy="`stemmap map` maps the cloud as a whole, without a robot"
-        ) from None
-    kind = f"simulated drive through a whole cloud ({cloud.description.kind})"
-    return SimulatedSource(uri, run, knows_trees=trees is not None, kind=kind, warnings=run.warnings)

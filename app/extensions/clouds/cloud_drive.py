@@ -14,14 +14,20 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import urlencode
 
 import numpy as np
 
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, UsageError
 from pipeline.geometry.poses import Pose3
 from pipeline.ground.plot_ground import finish, ground_steps
 from pipeline.ground.terrain_raster import TerrainRaster
+from pipeline.io.ground_truth import read_truth_trees
+from pipeline.io.readers.base import SourceOptions
+from pipeline.io.readers.clouds import open_cloud
+from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.jit import compiled
 from pipeline.simulation import run as simulated
 from pipeline.simulation.lidar import SpinningLidar, Sweep, scan_of_returns
@@ -35,7 +41,7 @@ from pipeline.simulation.robot_motion import (
     lay_on_terrain,
 )
 from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, random_stream
-from pipeline.simulation.scenarios import RunRequest
+from pipeline.simulation.scenarios import OPTIONS, SCHEME, RunRequest, option_values
 from pipeline.simulation.scene import SimulatedScene
 from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees, WholeCloud
@@ -283,6 +289,63 @@ class CloudRun(SimulatedRun):
         version = f"{simulated.VERSION}.{VERSION}"
         text = f"stemmap cloud {version}; {request}; {self.source_digest}; {self._mounting()}"
         return hashlib.sha256(text.encode()).hexdigest()
+
+
+#: Options of the address `sim:cloud`.
+DRIVE_OPTIONS = {
+    "file": (str, "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd"),
+    "truth": (str, "a table (CSV) of its trees in the coordinates of the cloud"),
+    **{key: OPTIONS[key] for key in ("seed", "sigma", "odometry", "duration")},
+}
+
+
+def parse_drive(uri: str, seed: int = 0) -> tuple[str, str, RunRequest]:
+    """Return the file of the cloud, the table of its trees ("" for none), and the request of
+    `sim:cloud?file=FILE&key=value`. Its duration is 0, for one loop, if the URI has none.
+
+    Args:
+        uri: As the user wrote it; the part after "?" is percent-encoded.
+        seed: Seed of a URI that names none.
+
+    Raises:
+        UsageError: An option is unknown, given twice or out of bounds, or there is no file.
+    """
+    values = option_values(uri, uri.partition("?")[2], DRIVE_OPTIONS)
+    if not values.get("file"):
+        raise UsageError(
+            "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
+        )
+    name = uri.partition("?")[0].removeprefix(SCHEME)
+    quality = values.get("sigma", 0.02), values.get("odometry", "normal")
+    request = RunRequest(name, values.get("seed", seed), *quality, values.get("duration", 0.0), 0)
+    return values["file"], values.get("truth", ""), request
+
+
+def open_drive(uri: str, path: Path, options: SourceOptions) -> SimulatedSource:
+    """Open a whole cloud as a run: a simulated robot drives through it.
+
+    Args:
+        uri: Path of the cloud, or the address `sim:cloud`, as the user wrote it.
+        path: File of the cloud; not used for an address.
+        options: Choices of the user, of which seed and extrinsics are used.
+
+    Raises:
+        UsageError: See `parse_drive`.
+        SourceError: The cloud or the ground truth cannot be read, or the cloud has no path for a robot.
+    """
+    is_address = uri.startswith(f"{SCHEME}cloud")
+    address = uri if is_address else f"{SCHEME}cloud?{urlencode({'file': str(path)})}"
+    file, truth, request = parse_drive(address, options.seed)
+    trees = read_truth_trees(Path(truth).expanduser()) if truth else None
+    cloud = open_cloud(file, options)
+    try:
+        run = open_cloud_run(request, cloud, trees, options.T_base_lidar)
+    except SourceError as error:
+        raise SourceError(
+            error.what, where=uri, remedy="`stemmap map` maps the cloud as a whole, without a robot"
+        ) from None
+    kind = f"simulated drive through a whole cloud ({cloud.description.kind})"
+    return SimulatedSource(uri, run, knows_trees=trees is not None, kind=kind, warnings=run.warnings)
 
 
 def open_cloud_run(

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from app.common.settings import Settings
+from app.extensions.clouds import cloud_drive
+from app.extensions.clouds.cloud_drive import first_surfels, lay_surfels, open_drive, parse_drive
 from app.web.routes.access import permitted_uri
 from pipeline.errors import SourceError
-from pipeline.io.readers.simulated import open_simulated as open_source
-from pipeline.simulation import cloud_run
-from pipeline.simulation.cloud_run import first_surfels, lay_surfels
+from pipeline.io.readers import SourceOptions
+from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.simulation.lidar import SpinningLidar
-from pipeline.simulation.scenarios import parse_uri
 from tests.pipeline.plots import PLACES, plot, stem, write_las
+
+
+def open_source(uri: str, options: SourceOptions | None = None) -> SimulatedSource:
+    return open_drive(uri, Path(), options or SourceOptions())
+
 
 UTM = (470600.0, 3810200.0, 2278.0)
 
@@ -46,7 +52,7 @@ def test_a_loop_ends_where_it_began(source):
 
 
 def test_a_loop_that_is_cut_short_says_so(files, monkeypatch):
-    monkeypatch.setattr(cloud_run, "LONGEST", 12.0)
+    monkeypatch.setattr(cloud_drive, "LONGEST", 12.0)
     uri = f"sim:cloud?file={files / 'plot.laz'}"
     cut = open_source(uri).description
     assert cut.scans == 120
@@ -122,12 +128,11 @@ def test_the_side_of_a_sparse_trunk_is_no_wall():
         ("sim:cloud?file=a.laz&trees=3", "no option"),
         ("sim:cloud?file=a.laz&odometry=psychic", "does not fit"),
         ("sim:cloud?file=a.laz&sigma=9", "does not fit"),
-        ("sim:stand?file=a.laz", "no option"),
     ],
 )
 def test_what_cannot_be_asked_for_is_refused(uri, why):
     with pytest.raises(SourceError, match=why):
-        parse_uri(uri)
+        parse_drive(uri)
 
 
 def test_a_missing_or_broken_cloud_is_one_line(files):
