@@ -12,14 +12,13 @@ import asyncio
 import contextlib
 import ctypes
 import faulthandler
-import logging
 import os
 import select
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 from weakref import WeakKeyDictionary
@@ -27,7 +26,6 @@ from weakref import WeakKeyDictionary
 import msgspec
 
 from app.common.child_process import ChildError, ChildProcess, ProtocolError, python_module
-from app.extension import all_extensions, switched_off
 from app.sources.live_address import is_live, parse_address
 from app.sources.one_step import check_one_step
 from app.sources.request import SourceRequest
@@ -35,7 +33,6 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import (
     Source,
     SourceOptions,
-    add_formats,
     check_existence,
     format_of_address,
     path_of,
@@ -46,29 +43,9 @@ from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
 
 if TYPE_CHECKING:
-    from pipeline.io.readers import Format, PacketFormat
     from pipeline.types.records import WholeCloud
 
-_log = logging.getLogger(__name__)
 
-
-def _formats_of_extensions() -> list[Format | PacketFormat]:
-    """Return the formats of the extensions; those of extensions that are switched off refuse their files.
-    Those of an extension that fails to name them are left out, and this is logged."""
-    found: list[Format | PacketFormat] = []
-    for each in all_extensions():
-        if each.extension is None or each.extension.formats is None:
-            continue
-        try:
-            for kind in each.extension.formats():
-                found.append(kind if each.is_on else replace(kind, refusal=switched_off(each.name)))
-        except Exception:  # the code of others: other files can be opened without it
-            _log.exception("the formats of the extension %s are left out", each.name)
-    return found
-
-
-# Each process that opens files imports this module.
-add_formats(_formats_of_extensions)
 _PR_SET_PDEATHSIG = 1
 _DAMAGED = "The file is damaged, or this is a fault in stemmap"
 

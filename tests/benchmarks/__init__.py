@@ -4,4 +4,4 @@ Each module of `cases` is one benchmark with `NAME`, `LINE` and `run() -> list[T
 process of its own.
 """
 
-import app.sources.opening  # noqa: F401 - adds the formats of the extensions
+import app.sources  # noqa: F401 - adds the formats of the extensions

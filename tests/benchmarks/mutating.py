@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import app.sources.opening  # noqa: F401 - adds the formats of the extensions
+import app.sources  # noqa: F401 - adds the formats of the extensions
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import open_cloud

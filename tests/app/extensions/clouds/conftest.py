@@ -1,3 +1,3 @@
 """The formats of the extensions are known."""
 
-import app.sources.opening  # noqa: F401 - adds these formats
+import app.sources  # noqa: F401 - adds these formats

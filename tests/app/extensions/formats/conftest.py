@@ -1,6 +1,6 @@
 """The fixture that opens sources, with the formats of the extensions."""
 
-import app.sources.opening  # noqa: F401 - adds these formats
+import app.sources  # noqa: F401 - adds these formats
 from tests.pipeline.io.conftest import opened
 
 __all__ = ["opened"]
