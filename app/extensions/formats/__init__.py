@@ -28,7 +28,7 @@ def _is_tree_manager(names: Collection[str]) -> bool:
 
 def _formats() -> tuple[Format | PacketFormat, ...]:
     """Return the formats."""
-    from pipeline.io.readers import Format, PacketFormat
+    from pipeline.io.readers import Format, PacketFormat, format_of_points
     from pipeline.io.readers.sensor_families import HESAI_SCANS, OUSTER_PACKETS
 
     stems = "a folder of TreeManagerState_<i>.csv with trajectory.txt"
@@ -40,6 +40,21 @@ def _formats() -> tuple[Format | PacketFormat, ...]:
             (".zip",),
             _later("victoria_park", "VictoriaParkSource"),
         ),
+        format_of_points(
+            "whole cloud .e57",
+            (b"ASTM-E57",),
+            ".e57",
+            by_contents=False,
+            table=_later("e57", "open_e57"),
+        ),
+        format_of_points(
+            "whole cloud as text (.xyz, .txt, .asc, .csv, .pts)",
+            (),
+            *(".xyz", ".asc", ".pts", ".txt", ".csv"),
+            by_contents=False,
+            table=_later("text_points", "open_text"),
+            accepts=_later("text_points", "is_text_of_points"),
+        ),
         Format(stems, (), (), _later("tree_manager", "TreeManagerSource"), is_folder=_is_tree_manager),
         PacketFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "PacketDecoder")),
         PacketFormat(
@@ -49,7 +64,7 @@ def _formats() -> tuple[Format | PacketFormat, ...]:
 
 
 EXTENSION = Extension(
-    help="readers of rare files: packet captures, packets of Hesai and Ouster, TreeManager, Victoria Park",
+    help="readers of rare files: .e57, text clouds, packet captures, packets of Hesai and Ouster, ...",
     takes={"export": "app.extensions.formats.export_command"},
     formats=_formats,
 )

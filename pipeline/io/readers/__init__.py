@@ -9,10 +9,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.packets import PacketFormat
+
+if TYPE_CHECKING:
+    from pipeline.io.readers.point_files import PointTable
 
 __all__ = ["PacketFormat", "Source", "SourceDescription", "SourceOptions", "open_source", "path_of"]
 
@@ -135,7 +139,7 @@ def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
             remedy="Compare it with the original: if that is empty too, nothing was recorded.",
         )
     kind = file_format(path, head)
-    if kind is not None and kind.holds_points:
+    if kind is not None and kind.holds_points and not kind.refusal:
         return _cloud if is_cloud(str(path), options) else _scans
     if kind is None:
         promised = expected_format(path)
@@ -188,6 +192,9 @@ class Format:
         is_cloud: Whether it is usually a whole cloud.
         holds_points: Whether it is a file of points: a whole cloud or one scan.
         depends_on_contents: Whether its contents decide which of them, see `cloud_or_scan`.
+        table: Opens the table of a file of points (`PointTable`); None for the formats of this package.
+        accepts: Whether a file with these first bytes is of this format, for a format without magic bytes
+            whose suffixes others have, too; None for other formats.
         scheme: Beginning of the addresses that it opens, such as "sim:cloud"; "" for none.
         scans_clouds: Whether it opens whole clouds as runs of scans.
         is_folder: Whether a folder with files of these names is of this format; None for a format of files.
@@ -201,6 +208,8 @@ class Format:
     is_cloud: bool = False
     holds_points: bool = False
     depends_on_contents: bool = False
+    table: Callable[[Path], PointTable] | None = None
+    accepts: Callable[[bytes], bool] | None = None
     scheme: str = ""
     scans_clouds: bool = False
     is_folder: Callable[[Collection[str]], bool] | None = None
@@ -211,7 +220,7 @@ def format_of_address(uri: str) -> Format | None:
     """Return the format that opens an address, by its beginning up to "?"; None if there is none. Raises
     SourceError if it cannot be used."""
     beginning = uri.partition("?")[0]
-    kind = next((kind for kind in formats() if kind.scheme == beginning), None)
+    kind = next((kind for kind in formats() if kind.scheme and kind.scheme == beginning), None)
     if kind is not None and kind.refusal:
         raise SourceError(f"{kind.words} needs an extension", where=uri, remedy=kind.refusal)
     return kind
@@ -228,32 +237,34 @@ def opener_of(kind: Format) -> Opener:
     return refused if kind.refusal else kind.open
 
 
-def _points(
-    words: str, magic: tuple[bytes, ...], *suffixes: str, is_cloud: bool = True, by_contents: bool = True
+def format_of_points(
+    words: str,
+    magic: tuple[bytes, ...],
+    *suffixes: str,
+    is_cloud: bool = True,
+    by_contents: bool = True,
+    table: Callable[[Path], PointTable] | None = None,
+    accepts: Callable[[bytes], bool] | None = None,
 ) -> Format:
     """Return a format of files of points, see `Format`."""
-    return Format(words, magic, suffixes, _cloud if is_cloud else _scans, is_cloud, True, by_contents)
+    opener = _cloud if is_cloud else _scans
+    return Format(words, magic, suffixes, opener, is_cloud, True, by_contents, table, accepts)
 
 
 FILES = (
     Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _recording),
     Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
-    _points(".pcd (whole cloud or scan)", (b"# .PCD", b"VERSION", b"FIELDS"), ".pcd", is_cloud=False),
-    _points("whole cloud .laz or .las", (b"LASF",), ".laz", ".las", by_contents=False),
-    _points("whole cloud .e57", (b"ASTM-E57",), ".e57", by_contents=False),
-    _points("whole cloud .ply", (b"ply\n", b"ply\r"), ".ply"),
-    _points("whole cloud .npy or .npz", (b"\x93NUMPY",), ".npy", ".npz"),
-    _points("KITTI .bin", (), ".bin", is_cloud=False),
-    _points(
-        "whole cloud as text (.xyz, .txt, .asc, .csv, .pts)", (), ".xyz", ".asc", ".pts", by_contents=False
+    format_of_points(
+        ".pcd (whole cloud or scan)", (b"# .PCD", b"VERSION", b"FIELDS"), ".pcd", is_cloud=False
     ),
+    format_of_points("whole cloud .laz or .las", (b"LASF",), ".laz", ".las", by_contents=False),
+    format_of_points("whole cloud .ply", (b"ply\n", b"ply\r"), ".ply"),
+    format_of_points("whole cloud .npy or .npz", (b"\x93NUMPY",), ".npy", ".npz"),
+    format_of_points("KITTI .bin", (), ".bin", is_cloud=False),
 )
 
 _MOST_NAMED = 5
-#: Suffixes of text that is a cloud only if its lines are points: poses, times and true trees have them too.
-_TEXTS = (".txt", ".csv")
-TEXT = FILES[-1]
 _further: list[Callable[[], Iterable[Format | PacketFormat]]] = []
 
 
@@ -286,8 +297,8 @@ def readable() -> str:
 
 def file_format(path: Path, head: bytes) -> Format | None:
     """Return the format of a file, None if it is unknown. The first bytes decide; the suffix decides for .npz
-    and for formats without magic bytes. A text with another suffix or none is a cloud if its lines are
-    points.
+    and for formats without magic bytes. A file with an unknown suffix or none has the format that accepts its
+    first bytes.
 
     Args:
         path: The file; it is not opened.
@@ -298,27 +309,19 @@ def file_format(path: Path, head: bytes) -> Format | None:
     for kind in formats():
         if any(head.startswith(mark) for mark in kind.magic):
             return kind
-    suffix = path.suffix.lower()
-    if suffix in _TEXTS:
-        return TEXT
-    known = next((kind for kind in formats() if not kind.magic and suffix in kind.suffixes), None)
-    return known or (TEXT if expected_format(path) is None and _is_text_of_points(head) else None)
+    expected = expected_format(path)
+    if expected is not None:
+        return None if expected.magic else expected
+    return next((kind for kind in formats() if kind.accepts is not None and kind.accepts(head)), None)
 
 
-def _is_text_of_points(head: bytes) -> bool:
-    """Return whether a file is a text of points by its first bytes."""
-    from pipeline.io.readers.text_points import is_text_of_points
-
-    return is_text_of_points(head)
-
-
-_HEAD = 64 << 10  # bytes by which a format is found
+HEAD = 64 << 10  # bytes by which a format is found
 
 
 def _head_of(path: Path) -> bytes:
     """Return the first bytes of a file; OSError if it cannot be read."""
     with path.open("rb") as file:
-        return file.read(_HEAD)
+        return file.read(HEAD)
 
 
 def expected_format(path: Path) -> Format | None:
@@ -361,12 +364,13 @@ def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a file is a run or a cloud by its suffix, a .txt or .csv by its first lines; False for
-    one that cannot be read."""
-    if path.suffix.lower() not in _TEXTS:
-        return expected_format(path) is not None
+    """Return whether a file is a run or a cloud by its suffix, and where others have it, too, by its first
+    bytes; False for one that cannot be read."""
+    expected = expected_format(path)
+    if expected is None or expected.accepts is None:
+        return expected is not None
     try:
-        return _is_text_of_points(_head_of(path))
+        return expected.accepts(_head_of(path))
     except OSError:
         return False
 

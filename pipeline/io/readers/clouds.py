@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import struct
-from bisect import bisect_right
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
+from pipeline.io.readers import HEAD, expected_format, file_format, readable
 from pipeline.io.readers.base import COORDINATE_LIMIT, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.cloud_frame import CloudSample, FileFrame, frame_of, sample_of
 from pipeline.io.readers.cloud_or_scan import Form, form_of, is_decided_by_points
@@ -20,7 +19,6 @@ from pipeline.io.readers.point_files import (
     EXPORT,
     MISSING,
     MOST_POINTS,
-    PART,
     REMEDY,
     Columns,
     PointTable,
@@ -30,7 +28,6 @@ from pipeline.io.readers.point_files import (
     open_rows,
     open_table,
 )
-from pipeline.io.readers.text_points import open_text
 from pipeline.types.records import CloudDescription, Float, Float32
 
 if TYPE_CHECKING:
@@ -40,7 +37,8 @@ _AXES = ("x", "y", "z")
 
 
 def open_cloud(uri: str, options: SourceOptions | None = None) -> PointCloud:
-    """Open a whole cloud by its first bytes or its suffix: E57, LAS or LAZ, PLY, NumPy, PCD or text.
+    """Open a whole cloud by its first bytes or its suffix: LAS or LAZ, PLY, NumPy, PCD, or a format that was
+    added.
 
     Args:
         uri: Path as the user wrote it.
@@ -64,23 +62,31 @@ def open_cloud(uri: str, options: SourceOptions | None = None) -> PointCloud:
 
 
 def open_points(path: Path) -> PointTable:
-    """Return the table of a file: LAS, LAZ and E57 by its first bytes or its suffix, else by `open_table`;
-    KITTI .bin by its suffix, and text by its lines.
+    """Return the table of a file: LAS and LAZ by its first bytes or its suffix, PLY, NumPy and PCD by its
+    first bytes, KITTI .bin by its suffix, others by the formats that were added.
 
     Raises:
-        ScanFileError: The file has an unknown format, contradicts itself, or has no x, y and z; or it is an
-            E57 file and pye57 is not installed.
+        ScanFileError: The file has an unknown format, or one that cannot be used, contradicts itself, or has
+            no x, y and z.
         OSError: The file cannot be read.
     """
     with path.open("rb") as file:
-        head = file.read(16)
-    if head[:8] == b"ASTM-E57" or path.suffix.lower() == ".e57":
-        return _open_e57(path)
-    if head.startswith(b"LASF") or path.suffix.lower() in (".las", ".laz"):
+        head = file.read(HEAD)
+    suffix = path.suffix.lower()
+    if head.startswith(b"LASF"):
         return _open_las(path)
-    if is_table(head):
+    if is_table(head[:16]):
         return open_table(path)
-    return open_rows(path) if path.suffix.lower() == ".bin" else open_text(path)
+    if suffix == ".bin":
+        return open_rows(path)
+    kind = file_format(path, head) or expected_format(path)
+    if kind is not None and kind.refusal:
+        raise ScanFileError(f"{kind.words} needs an extension", kind.refusal)
+    if kind is not None and kind.table is not None:
+        return kind.table(path)
+    if suffix in (".las", ".laz"):
+        return _open_las(path)
+    raise ScanFileError("not a file of points", readable())
 
 
 def form_of_file(path: Path) -> Form:
@@ -462,88 +468,3 @@ def _is_vertical(number: int) -> bool:
         return bool(pyproj.CRS.from_epsg(number).is_vertical)
     except pyproj.exceptions.ProjError:
         return False
-
-
-# --- E57 ---
-
-MOST_STATIONS = 10_000
-_CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
-_SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_STATES = ("cartesianInvalidState", "sphericalInvalidState")
-
-
-def _open_e57(path: Path) -> PointTable:
-    """Return the table of the positions of all stations of an E57 file (ASTM E2807) in one frame; invalid
-    points are NaN.
-
-    Raises:
-        ScanFileError: pye57 is not installed, the file is damaged, or there are too many stations or points.
-        OSError: The file cannot be read.
-    """
-    try:
-        from pye57 import E57
-    except ImportError:
-        raise ScanFileError("E57 files need pye57", "Install it with: uv sync --extra e57") from None
-    with errors_as_damage("the E57 file is damaged"), closing(E57(str(path))) as file:
-        stations = int(file.scan_count)
-        if stations > MOST_STATIONS:
-            raise ScanFileError(f"it promises {stations} stations")
-        points = [int(file.get_header(k).point_count) for k in range(stations)]
-    if not all(0 <= n <= MOST_POINTS for n in points) or sum(points) > MOST_POINTS:
-        raise ScanFileError("it promises more points than there can be")
-
-    starts = np.cumsum([0, *points])[:-1].tolist()
-
-    def read(begin: int = 0) -> Iterator[Columns]:
-        """Yield the coordinates of the points of all stations from the one of the point `begin` on, float64
-        [m]."""
-        with closing(E57(str(path))) as file:
-            for station in range(bisect_right(starts, begin) - 1, stations):
-                for xyz in _station(file, station):
-                    yield dict(zip(_AXES, xyz.T, strict=True))
-
-    kind = f"E57, {stations} station{'s' * (stations != 1)}"
-    return PointTable(kind, sum(points), _AXES, read, has_voids=True, starts=tuple(starts), units=("m", "m"))
-
-
-def _station(file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types
-    """Yield the points of a station in the frame of the file in parts, shape (N, 3) [m]; NaN for invalid
-    ones.
-
-    Raises:
-        ScanFileError: The points have no coordinates.
-    """
-    header = file.get_header(station)
-    there = set(header.point_fields)
-    axes = _CARTESIAN if there.issuperset(_CARTESIAN) else _SPHERICAL
-    if not there.issuperset(axes):
-        raise ScanFileError("its points have no coordinates")
-    wanted = [*axes, *(name for name in _STATES if name in there)]
-    R, t = _pose(header)
-    arrays, buffers = file.make_buffers(wanted, PART)
-    with closing(header.points.reader(buffers)) as reader:
-        while count := reader.read():
-            columns = {name: np.array(arrays[name][:count], dtype=np.float64) for name in wanted}
-            with np.errstate(over="ignore", invalid="ignore"):
-                xyz = _cartesian(columns, axes) @ R.T + t
-            for name in wanted[3:]:
-                xyz[columns[name] != 0] = np.nan
-            yield xyz
-
-
-def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401
-    """Return rotation, shape (3, 3), and translation, shape (3,) [m], of a station in the frame of the file;
-    those of the identity if the header has no pose."""
-    if not header.has_pose():
-        return np.eye(3), np.zeros(3)
-    return np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)
-
-
-def _cartesian(columns: dict[str, Float], axes: tuple[str, ...]) -> Float:
-    """Return positions, shape (N, 3) [m], from the three columns of `columns` with the names `axes`:
-    Cartesian, or range [m], azimuth and elevation [rad]."""
-    first, second, third = (columns[name] for name in axes)
-    if axes == _CARTESIAN:
-        return np.stack([first, second, third], axis=1)
-    flat = first * np.cos(third)
-    return np.stack([flat * np.cos(second), flat * np.sin(second), first * np.sin(third)], axis=1)
