@@ -13,8 +13,6 @@ from app.extensions.maps.localisation.stored_map import LARGEST_FILE
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
 
-ENDING = ".stems"
-
 
 def read_stored_map(path: Path) -> StoredMap:
     """Return the map of a run folder, without the trees that a person rejected, or of a file of
