@@ -192,7 +192,7 @@ def export_run(run: R, file: FilePath, writers: Mapping[str, Writer[R]]) -> list
     if writer is None:
         raise StemmapError(
             f"{file.name!r} has an unknown format",
-            remedy=f"Formats: {', '.join([*writers, '.laz'])}. Tables (.csv) are in the folder of the run.",
+            remedy=f"Formats: {', '.join(writers)}. Tables (.csv) are in the folder of the run.",
         )
     with _WRITING, TemporaryDirectory(prefix=".export-", dir=file.parent) as folder:
         writer(run, FilePath(folder) / file.name)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag), a folder of scans (.bin, .pcd, .ply, "
     ".npy, .npz, .las, .laz), "
-    "a whole cloud (.laz, .las, .e57, .ply, .npy, .npz), "
+    "a whole cloud (.laz, .las, .ply, .npy, .npz), "
     "a live robot (zenoh:tcp/host:7447, velodyne:ADDRESS:PORT?from=SENSOR), "
     "or a simulated run such as sim:stand"
 )

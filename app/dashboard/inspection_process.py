@@ -129,22 +129,6 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def cloud(question: dict[str, Any]) -> dict[str, Any]:
-    """Write the cloud of a run to cloud.laz; return {"file": its path}.
-
-    Args:
-        question: The key "path" has the folder of the run, and "folder" that of the file.
-
-    Raises:
-        StemmapError: See `app.batch.mapped_cloud.write_cloud`.
-    """
-    from app.batch.mapped_cloud import write_cloud
-
-    file = Path(question["folder"]) / "cloud.laz"
-    write_cloud(Path(question["path"]), file)
-    return {"file": str(file)}
-
-
 def export(question: dict[str, Any]) -> dict[str, Any]:
     """Export a run to a file for geographic information systems; return {"file": its path}.
 
@@ -216,7 +200,6 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "first_scan": first_scan,
     "inside": inside,
     "finished": finished,
-    "cloud": cloud,
     "export": export,
     "layer": layer,
     "alignment": alignment,

@@ -46,7 +46,6 @@ SESSION_S = 7 * 86_400
 TICKET_S = 60
 _SAFE_METHODS = frozenset({"GET", "HEAD"})
 _CHANGES_NOTHING = frozenset({("POST", "/api/compare")})  # a query with a body
-_OF_OWNERS = frozenset({"/api/export/laz"})  # reads a whole recording again: minutes of work
 _FORWARDING = (
     "forwarded",
     "via",
@@ -376,14 +375,13 @@ class Guard:
         return None
 
     def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return 403 for a viewer who tries to change something or asks for work of minutes; None otherwise,
-        also for all websockets and for a comparison of parameter sets. Stores the role of the request in
-        `scope`."""
+        """Return 403 for a viewer who tries to change something; None otherwise, also for all websockets and for
+        a comparison of parameter sets. Stores the role of the request in `scope`."""
         role = self._role(headers)
         scope.setdefault("state", {})["role"] = role
         if role == "owner" or scope["type"] == "websocket":
             return None
-        if scope["method"] in _SAFE_METHODS and scope["path"] not in _OF_OWNERS:
+        if scope["method"] in _SAFE_METHODS:
             return None
         if (scope["method"], scope["path"]) in _CHANGES_NOTHING:
             return None

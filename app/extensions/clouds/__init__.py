@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 from app.extension import Extension, page_folder
 
 if TYPE_CHECKING:
+    from fastapi import FastAPI
+
     from pipeline.io.readers import Format, Source, SourceOptions
 
 
@@ -26,13 +28,22 @@ def _formats() -> tuple[Format, ...]:
     return (Format("a whole cloud", (), (), _open_drive, scheme="sim:cloud", scans_clouds=True),)
 
 
+def _add_routes(app: FastAPI) -> None:
+    """Add the cloud of the open run to a dashboard."""
+    from app.extensions.clouds.routes import router
+
+    app.include_router(router)
+
+
 EXTENSION = Extension(
-    help="whole clouds (.laz, .las, .e57, ...): their stems, diameters and heights, mapped without a drive",
+    help="whole clouds (.laz, .las, ...): stems, diameters and heights without a drive; clouds of runs",
     takes={
         "map": "app.extensions.clouds.map_command",
         "info": "app.extensions.clouds.info_command",
+        "export": "app.extensions.clouds.export_command",
     },
     formats=_formats,
+    web=_add_routes,
     sources="app.extensions.clouds.sources",
     page=page_folder("clouds"),
 )

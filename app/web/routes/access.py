@@ -20,7 +20,7 @@ from urllib.parse import parse_qsl, urlencode
 import msgspec
 from fastapi import Depends
 from pydantic import Field
-from starlette.exceptions import WebSocketException
+from starlette.exceptions import HTTPException, WebSocketException
 from starlette.requests import HTTPConnection
 from starlette.responses import Response
 from starlette.status import WS_1013_TRY_AGAIN_LATER
@@ -111,6 +111,12 @@ async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
         yield
 
 
+def _owner(connection: HTTPConnection) -> None:
+    """Raise 403 for a viewer."""
+    if role_of(connection.scope) == "viewer":
+        raise HTTPException(403, "this is a view-only link")
+
+
 @asynccontextmanager
 async def in_thread(context: AbstractContextManager[T]) -> AsyncIterator[T]:
     """Yield the value of a context that is entered in a thread, because entering it writes files; it is left
@@ -125,6 +131,8 @@ Permission = Callable[[str], str | None]
 Permitted = Annotated[Permission, Depends(_permission)]
 #: For routes that cost the mapping process or this one more than some milliseconds.
 ViewerTurn = Depends(_viewer_turn, scope="function")
+#: For routes that cost minutes of work.
+OwnerOnly = Depends(_owner)
 
 
 # --- which files may be opened ------------------------------------------------------------------------

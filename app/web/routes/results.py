@@ -112,13 +112,6 @@ def folder_of_export() -> Iterator[FilePath]:
         yield FilePath(name)
 
 
-@router.get("/export/laz")
-async def export_cloud(dashboard: Dash, there: Annotated[FilePath, Depends(folder_of_export)]) -> Response:
-    """Return the cloud of the run as LAZ, see `app.batch.mapped_cloud.write_cloud`; a child process reads the
-    source again. Only for owners. 409 before the first map; 422 if the source cannot be read."""
-    return await exported_file(dashboard, ShownRun.of(dashboard), {"ask": "cloud"}, there)
-
-
 @router.get("/export/{suffix}", dependencies=[ViewerTurn])
 async def export(
     suffix: Literal["gpkg", "geojson"],

@@ -12,8 +12,8 @@
 //   mapTools()        tools for the pointer on the 2D map, [{busy, press, drag, release, hover, click}, ...]; the functions take what
 //                     those of `gestures` of MapCanvas take, then the view, and return whether they took the event; busy() is true
 //                     while the tool is in use
-//   exportFiles()     files for the menu Export, [{value, text, before, save}, ...], with the value of the option behind it; save(title)
-//                     saves the file of a run with this title, also in place of an option with the same value
+//   exportFiles()     files for the menu Export, [{value, text, before, edits, save}, ...], with the value of the option behind it and
+//                     whether only owners have it; save(title) saves the file of a run with this title, also in place of an option with the same value
 //   sourceChoice()    what is chosen in the dialog Open, {node, takes(path), moves(), address(path), fields(), forget()}: the element,
 //                     for which paths it is shown, whether the source has a motion, the address of the path and fields of the
 //                     request by the choices, and back to the beginning

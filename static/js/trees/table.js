@@ -159,7 +159,7 @@ function exportAs(format) {
   const title = titleOf(state.status?.source);
   const own = ofExtensions("exportFiles").find(({ value }) => value === format);
   if (own) return own.save(title);
-  return saveWritten("Writing the file …", fileName(title, format === "laz" ? "cloud.laz" : `trees.${format}`), `/api/export/${format}`);
+  return saveWritten("Writing the file …", fileName(title, `trees.${format}`), `/api/export/${format}`);
 }
 
 function emptyText(all, wanted, refused) {
@@ -197,7 +197,7 @@ export function startTable() {
   byId("find").title = HELP;
   const menu = byId("trees-export");
   const optionOf = (value) => [...menu.options].find((each) => each.value === value) ?? null;
-  for (const { value, text, before } of ofExtensions("exportFiles")) if (!optionOf(value)) menu.add(el("option", { value, text }), before ? optionOf(before) : null);
+  for (const { value, text, before, edits } of ofExtensions("exportFiles")) if (!optionOf(value)) menu.add(el("option", { value, text, "data-edit": edits }), before ? optionOf(before) : null);
   menu.addEventListener("change", () => { exportAs(menu.value); menu.value = ""; });
   byId("trees-png").addEventListener("click", () => saveCanvas(fileName(titleOf(state.status?.source), "trees.png"), pictureOf(byId("trees"))));
   csv.addEventListener("click", (event) => {

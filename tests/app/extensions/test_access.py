@@ -38,3 +38,10 @@ async def test_routes_of_extensions_are_guarded(added: set[tuple[str, str]]):
                 foreign = {**BEARER, "Origin": "http://evil.example"}
                 assert (await client.request(method, path, headers=foreign)).status_code == 403
                 assert (await client.request(method, path, headers=VIEWER)).status_code == 403
+
+
+async def test_what_costs_minutes_is_for_owners():
+    async with running() as (client, _):
+        answer = await client.get("/api/export/laz", headers=VIEWER)
+        assert (answer.status_code, answer.json()["error"]["what"]) == (403, "this is a view-only link")
+        assert (await client.get("/api/export/laz", headers=BEARER)).status_code == 409  # no map yet

@@ -481,7 +481,7 @@ async def test_an_export_that_nobody_knows_is_refused(both: Running) -> None:
     assert (await client.get("/api/export/exe")).status_code == 422
 
 
-@pytest.mark.parametrize("suffix", ["laz", "gpkg", "geojson"])
+@pytest.mark.parametrize("suffix", ["gpkg", "geojson"])
 async def test_a_child_writes_the_file_of_an_export_which_is_removed(
     both: Running, monkeypatch, tmp_path, suffix
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from app.cli.export import CLOUD_SUFFIXES, print_written
+from app.cli.export import print_written
 from app.cli.stored import reviewed
 from app.extensions.stand.commands.flags import (
     add_plot_flags,
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     print its files; existing ones are replaced.
 
     Returns:
-        0; None for the file of the cloud, which the program writes.
+        0; None if no file is named.
 
     Raises:
         StemmapError: A flag is wrong, the run cannot be read or lacks what the format shows, or a package is
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int | None:
     from app.extensions.stand.gis_files import WRITERS, read_with_plots
     from app.extensions.stand.run_figures import stand_of
 
-    if arguments.to is None or Path(arguments.to).suffix.lower() in CLOUD_SUFFIXES:
+    if arguments.to is None:
         return None
     file = Path(arguments.to)
     with reviewed(arguments.run) as folder:

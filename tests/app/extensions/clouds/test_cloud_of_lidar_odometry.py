@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.batch.mapped_cloud import write_cloud
 from app.cli import main
+from app.extensions.clouds.mapped_cloud import write_cloud
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.pose_files import read_any_poses
 from pipeline.io.result_files import ODOMETRY, tum_text
