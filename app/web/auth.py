@@ -375,8 +375,8 @@ class Guard:
         return None
 
     def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return 403 for a viewer who tries to change something; None otherwise, also for all websockets and for
-        a comparison of parameter sets. Stores the role of the request in `scope`."""
+        """Return 403 for a viewer who tries to change something; None otherwise, also for all websockets and
+        for a comparison of parameter sets. Stores the role of the request in `scope`."""
         role = self._role(headers)
         scope.setdefault("state", {})["role"] = role
         if role == "owner" or scope["type"] == "websocket":

@@ -12,9 +12,7 @@ SUFFIXES = (".las", ".laz")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add a description; the command has the flags."""
-    parser.add_argument_group(
-        "cloud of --to", ".las and .laz: the points, with the number of the tree of each."
-    )
+    parser.add_argument_group("cloud of --to", ".las and .laz: points with the number of their tree.")
 
 
 def run(arguments: argparse.Namespace) -> int | None:

@@ -27,7 +27,7 @@ WORDS = {
     "cluster": r"\bdask|many_runs|map_runs",
     "dds": r"\bdds:|DdsLink|cyclone|plain DDS|fast_?dds",
     "fleet": r"fleet|robots-link|common.map",
-    "formats": r"victoria|tree.?manager|\bcapture (file|of packets)|extensions\.formats",
+    "formats": r"victoria|tree.?manager|extensions\.formats",
     "maps": r"--continue|ContinuedMap|continue_map|merge_runs|stemmap merge|merged_map|stemmap localise|"
     r"/api/localise|\"localise\"|Locate in",
     "search": r"sensitivity|TuneSearch|param.grid|/api/search|optuna|stemmap tune|\bsearch-(?!d)",
