@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from app.extensions.formats.ptx import is_ptx, open_ptx
 from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.io.readers.point_files import DEGREES, MOST_POINTS, Columns, PointTable, ScanFileError
-from pipeline.io.readers.ptx import is_ptx, open_ptx
 from pipeline.types.records import Float
 
 HEAD = 64 << 10  # bytes in which the layout is found
