@@ -326,7 +326,8 @@ def _head_of(path: Path) -> bytes:
 
 def expected_format(path: Path) -> Format | None:
     """Return the format by the suffix of a file, in upper or lower case; None for another suffix."""
-    return next((kind for kind in formats() if path.suffix.lower() in kind.suffixes), None)
+    suffix = path.suffix.lower()
+    return next((kind for kind in formats() if suffix in kind.suffixes), None)
 
 
 def points_format(uri: str) -> Format | None:
