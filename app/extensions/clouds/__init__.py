@@ -3,6 +3,7 @@ scanner measures it."""
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ def _open_drive(uri: str, path: Path, options: SourceOptions) -> Source:
     return open_drive(uri, path, options)
 
 
+@cache
 def _formats() -> tuple[Format, ...]:
     """Return the simulated drive through a cloud, by its address and for clouds that are opened as runs."""
     from pipeline.io.readers import Format

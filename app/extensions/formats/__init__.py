@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ def _is_tree_manager(names: Collection[str]) -> bool:
     return any(name.startswith("TreeManagerState_") for name in names)
 
 
+@cache
 def _formats() -> tuple[Format | PacketFormat, ...]:
     """Return the formats."""
     from pipeline.io.readers import Format, PacketFormat, format_of_points
