@@ -7,18 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.config.stages import Relocalisation
-from pipeline.errors import StemmapError
 from pipeline.evaluation import fit_rigid, match
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.loop_closure.stem_matching import MapStems, find_constellation
 from pipeline.types.records import Bool, Int
 
-# Assumed distortions of a map over the extent of a constellation [m], the smallest first.
-SLACKS = (0.1, 0.2, 0.3)
 FALSE_DISCOVERIES = 0.05  # expected share of trees with false growth among those with significant growth
 MOVED_SIGMAS, MOVED_MIN = 4.0, 0.15  # robust standard deviations, m
-_HYPOTHESES = 3_000_000
 _ROUNDS = 5
 
 
@@ -69,34 +63,6 @@ class VisitComparison:
     growth_sigma: Float
     significant: Bool
     moved: Bool
-
-
-def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tuple[Pose2, int]:
-    """Return the pose of b in the frame of a and the number of stems that agree, without an initial pose. The
-    distortions of the maps in SLACKS are tried in ascending order in place of the parameter `slack`, until a
-    pose is found.
-
-    Raises:
-        StemmapError: No pose is found, see `find_constellation`.
-    """
-    centre_a, centre_b = (np.nanmean(v.position, axis=0) if len(v.number) else np.zeros(2) for v in (a, b))
-    stems = [
-        MapStems(v.position - c, np.maximum(v.sigma, 0.02), v.dbh, v.dbh_sigma)
-        for v, c in ((a, centre_a), (b, centre_b))
-    ]
-    reason = "too few stems"
-    for slack in SLACKS:
-        chosen = parameters.model_copy(update={"slack": slack})
-        found = find_constellation(stems[1], stems[0], chosen, hypotheses=_HYPOTHESES)
-        if found.pose is not None:
-            there = Pose2(float(centre_a[0]), float(centre_a[1]), 0.0)
-            back = Pose2(-float(centre_b[0]), -float(centre_b[1]), 0.0)
-            return there @ found.pose @ back, len(found.local)
-        reason = found.reason or reason
-    raise StemmapError(
-        f"the stems of the two maps do not agree with certainty ({reason})",
-        remedy="Compare visits that share more trees, or give --same-frame if their coordinates are the same",
-    )
 
 
 def compare_visits(

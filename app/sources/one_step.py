@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from app.extension import all_extensions, switched_off
 from pipeline.errors import SourceError
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pipeline.types.records import Float, Float32, Frame, Record
 
 _log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +96,16 @@ class OneStepSource(FileSource):
     @abstractmethod
     def points(self) -> Iterator[Float]:
         """Yield all points in parts, in the coordinates of the file, shape (N, 3) [m]. Raises SourceError."""
+
+
+def finish(steps: Generator[float, None, T]) -> T:
+    """Return the result of a generator after all of its steps; what they yield is discarded."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
 
 
 def open_one_step(uri: str, options: SourceOptions | None = None) -> OneStepSource | None:

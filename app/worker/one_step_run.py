@@ -14,12 +14,11 @@ import numpy as np
 from app.batch.run_folder import NO_PATH
 from app.common.timers import Stopwatch
 from app.explain.records import ClusterStory, TreeStory
-from app.sources.one_step import OneStepMap, OneStepSource
+from app.sources.one_step import OneStepMap, OneStepSource, finish
 from app.worker.protocol import RunCounts, RunCourse
 from app.worker.tree_numbers import TreeNumbers
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
-from pipeline.ground.plot_ground import finish
 from pipeline.types.records import Float, Float32, Frame, Path, Trees
 
 

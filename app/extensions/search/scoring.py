@@ -23,14 +23,13 @@ from app.common.child_process import ParentConnection, run_child
 from app.dashboard.annotations import laid_over
 from app.extensions.search.jobs import Job, JobResult, RunWithTruth
 from app.extensions.search.plan import PlannedRun
-from app.sources.one_step import OneStepSource, open_one_step
+from app.sources.one_step import OneStepSource, finish, open_one_step
 from app.sources.request import SourceRequest, request_of_kept, with_odometry
 from app.store.forests import kept_forests, mapper_of
 from app.store.records import as_truth, contents_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import SourceError, StemmapError
-from pipeline.ground.plot_ground import finish
 from pipeline.io.readers import open_source
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps

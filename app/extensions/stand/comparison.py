@@ -16,7 +16,6 @@ from app.batch.run_folder import read_run, read_seen_area, read_tree_places
 from app.batch.visits import (
     VisitComparison,
     VisitTrees,
-    align_visits,
     compare_visits,
     with_known_sigma,
 )
@@ -24,15 +23,20 @@ from app.common.text import count, version
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plots import within_reach
 from pipeline.config import Parameters
+from pipeline.config.stages import Relocalisation
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.csv_table import CsvTable
 from pipeline.io.ground_truth import LARGEST_FILE, read_truth_trees
 from pipeline.io.result_files import csv_text
+from pipeline.loop_closure.stem_matching import MapStems, find_constellation
 from pipeline.seen_area import SeenArea
 from pipeline.types.records import Bool
 
+# Assumed distortions of a map over the extent of a constellation [m], the smallest first.
+SLACKS = (0.1, 0.2, 0.3)
+_HYPOTHESES = 3_000_000
 TABLE_SIGMA = 0.05  # m, of a position in a table
 # A greater median ratio of diameters is one of units: inch to cm is 2.54, circumference to diameter pi.
 LARGEST_RATIO = 2.0
@@ -79,6 +83,34 @@ class Visit:
         hull = shapely.MultiPoint(self.trees.position).convex_hull.buffer(BORDER)
         inside: Bool = shapely.contains_xy(hull, *np.reshape(points, (-1, 2)).T)
         return inside
+
+
+def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tuple[Pose2, int]:
+    """Return the pose of b in the frame of a and the number of stems that agree, without an initial pose. The
+    distortions of the maps in SLACKS are tried in ascending order in place of the parameter `slack`, until a
+    pose is found.
+
+    Raises:
+        StemmapError: No pose is found, see `find_constellation`.
+    """
+    centre_a, centre_b = (np.nanmean(v.position, axis=0) if len(v.number) else np.zeros(2) for v in (a, b))
+    stems = [
+        MapStems(v.position - c, np.maximum(v.sigma, 0.02), v.dbh, v.dbh_sigma)
+        for v, c in ((a, centre_a), (b, centre_b))
+    ]
+    reason = "too few stems"
+    for slack in SLACKS:
+        chosen = parameters.model_copy(update={"slack": slack})
+        found = find_constellation(stems[1], stems[0], chosen, hypotheses=_HYPOTHESES)
+        if found.pose is not None:
+            there = Pose2(float(centre_a[0]), float(centre_a[1]), 0.0)
+            back = Pose2(-float(centre_b[0]), -float(centre_b[1]), 0.0)
+            return there @ found.pose @ back, len(found.local)
+        reason = found.reason or reason
+    raise StemmapError(
+        f"the stems of the two maps do not agree with certainty ({reason})",
+        remedy="Compare visits that share more trees, or give --same-frame if their coordinates are the same",
+    )
 
 
 def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: bool = False) -> Visit:

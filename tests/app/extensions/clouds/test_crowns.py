@@ -9,8 +9,8 @@ import pytest
 
 from app.extensions.clouds.inventory import Inventory, map_plot
 from app.extensions.clouds.inventory.spooled_cloud import SpooledCloud
+from app.sources.one_step import finish
 from pipeline.config import preset
-from pipeline.ground.plot_ground import finish
 from tests.pipeline.plots import Made, ground, stem
 
 FOREST = preset("forest")

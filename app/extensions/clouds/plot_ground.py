@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -97,19 +96,6 @@ def _count(part: Float32, squares: dict[int, tuple[int, Float]]) -> None:
     for k, n, a, b in zip(key[starts].tolist(), sizes.tolist(), low, high, strict=True):
         before, bound = squares.get(k, (0, np.append(a, b)))
         squares[k] = (before + n, np.append(np.minimum(bound[:2], a), np.maximum(bound[2:], b)))
-
-
-T = TypeVar("T")
-
-
-def finish(steps: Generator[float, None, T]) -> T:
-    """Return the result of a generator after all of its steps; what they yield is discarded."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            result: T = end.value
-            return result
 
 
 def ground_steps(
