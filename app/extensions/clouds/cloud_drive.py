@@ -21,10 +21,10 @@ from urllib.parse import urlencode
 import numpy as np
 
 from app.extensions.clouds.plot_ground import ground_steps
+from app.extensions.clouds.terrain_raster import TerrainRaster
 from app.sources.one_step import finish
 from pipeline.errors import SourceError, UsageError
 from pipeline.geometry.poses import Pose3
-from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.io.ground_truth import read_truth_trees
 from pipeline.io.readers.base import SourceOptions
 from pipeline.io.readers.clouds import open_cloud

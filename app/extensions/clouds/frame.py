@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from app.extensions.clouds.inventory import PlotMap
+from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.classification.column_extraction import BREAST
 from pipeline.geometry.poses import Pose2
-from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.types.records import (
     Clusters,
     Detections,

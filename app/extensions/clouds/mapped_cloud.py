@@ -124,10 +124,10 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
         StemmapError: The run is live or has several recordings, its source cannot be read, or no point
             is near known ground.
     """
+    from app.extensions.clouds.thinning import Thinned
     from app.sources.live_address import is_live
     from app.sources.opening import open_source
     from app.sources.request import FILE, request_of_kept, with_odometry
-    from pipeline.geometry.thinning import Thinned
     from pipeline.ground.scan_ground import find_terrain, height_above
     from pipeline.preprocessing import acquire
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from app.extensions.clouds.terrain_raster import LowestReturns, TerrainRaster, heights_above
+from app.extensions.clouds.thinning import Thinned
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.geometry.thinning import Thinned
-from pipeline.ground.terrain_raster import LowestReturns, TerrainRaster, heights_above
 from pipeline.types.records import Float32, WholeCloud
 
 MOST_RASTER = 96 << 20  # bytes

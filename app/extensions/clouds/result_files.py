@@ -23,11 +23,11 @@ from app.batch.summary import FAR_FROM_PLOT, evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
 from app.extensions.clouds.inventory import PlotMap, map_plot
 from app.extensions.clouds.inventory.cross_sections import slice_heights
+from app.extensions.clouds.terrain_raster import TerrainRaster
 from app.store.forests import kept_forests
 from pipeline.config import Parameters
 from pipeline.evaluation import MapScores
 from pipeline.geometry.poses import Float
-from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.io.result_files import (
     ROBOTS_FRAME,
     TERRAIN_COLUMNS,

@@ -17,9 +17,9 @@ from tests.benchmarks.package_forest import DATA, REACH, STREET, training_exampl
 from tests.benchmarks.table import Cell, Table
 
 if TYPE_CHECKING:
+    from app.extensions.clouds.terrain_raster import TerrainRaster
     from app.extensions.learning.examples import Examples
     from pipeline.classification.forest import Forest
-    from pipeline.ground.terrain_raster import TerrainRaster
     from pipeline.types.records import CloudDescription, Float, Float32, WholeCloud
 
 NAME = "holdout"
@@ -186,7 +186,7 @@ class CutCloud:
         """See WholeCloud."""
         import numpy as np
 
-        from pipeline.ground.terrain_raster import heights_above
+        from app.extensions.clouds.terrain_raster import heights_above
 
         rng = np.random.default_rng(self.seed)
         for part in self.cloud.parts():

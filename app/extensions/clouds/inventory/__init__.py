@@ -39,13 +39,13 @@ from app.extensions.clouds.inventory.stem_model import (
     is_repeated,
 )
 from app.extensions.clouds.plot_ground import ground_steps
+from app.extensions.clouds.terrain_raster import TerrainRaster
+from app.extensions.clouds.thinning import Thinned
 from app.sources.one_step import finish
 from pipeline.classification import ForestOf, package_alone
 from pipeline.classification.forest import vote
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float
-from pipeline.geometry.thinning import Thinned
-from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.io.readers.cloud_frame import UNNAMED
 from pipeline.types.records import CloudDescription, Float32, Int, Int32, Trees, Verdict, WholeCloud
 

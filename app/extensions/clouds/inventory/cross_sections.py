@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.classification.column_extraction import BREAST, HIGH, MARGIN, examine
 from pipeline.classification.features import COUNT, features
 from pipeline.classification.voxel_map import SIDE, SLICE, SLICES, TILE, VoxelMap
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
-from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.jit import compiled
 from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Float32, Int

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from app.extensions.clouds.inventory.stem_model import Stems
+from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.classification.column_extraction import BREAST
 from pipeline.geometry.poses import Float
-from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.types.records import Float32, Int, Int32
 
 CELL = 0.25  # m; side of a voxel, the resolution of all rules here

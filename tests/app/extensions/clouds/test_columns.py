@@ -6,7 +6,7 @@ import numpy as np
 
 from app.extensions.clouds.inventory.cross_sections import find_columns, strongest_first
 from app.extensions.clouds.inventory.stem_model import STEM, is_repeated
-from pipeline.ground.terrain_raster import TerrainRaster
+from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.types.records import Verdict
 from tests.pipeline.plots import stem
 

@@ -7,8 +7,8 @@ import pytest
 
 from app.extensions.clouds.inventory import SECTION, map_plot
 from app.extensions.clouds.inventory.cross_sections import upper_end
+from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.config import preset
-from pipeline.ground.terrain_raster import TerrainRaster
 from pipeline.types.records import Verdict
 from tests.pipeline.plots import PLACES, Made, bush, ground, hill, plot, stem
 
