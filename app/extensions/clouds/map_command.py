@@ -18,8 +18,8 @@ def run(arguments: argparse.Namespace) -> int | None:
     """Map a whole cloud of a plot and print the result.
 
     Returns:
-        Exit code: 3 if points were left out, or the cloud is a section through its stems or may have another
-        axis up; else 0. None for another source.
+        Exit code: 3 if points were left out, or the cloud is a section or a slice of its stems, has coarse
+        coordinates or may have another axis up; else 0. None for another source.
 
     Raises:
         StemmapError: The arguments contradict each other, the cloud or --truth cannot be read, or the folder
@@ -41,9 +41,10 @@ def run(arguments: argparse.Namespace) -> int | None:
         )
     from app.batch.run_folder import check_folder, partial_output_warnings
     from app.cli.map import print_result
-    from app.extensions.clouds.inventory import SECTION
+    from app.extensions.clouds.inventory import SECTION, SLICE
     from app.extensions.clouds.result_files import map_plot_run
     from pipeline.io.ground_truth import read_truth_trees
+    from pipeline.io.readers.cloud_frame import TOO_COARSE
     from pipeline.io.readers.up_axis import UP_UNCLEAR
 
     flags.print_warnings(partial_output_warnings(arguments.out))
@@ -57,5 +58,5 @@ def run(arguments: argparse.Namespace) -> int | None:
         outcome.warnings,
         outcome.losses,
         replaces=replaces,
-        wrong=(SECTION, UP_UNCLEAR),
+        wrong=(SECTION, SLICE, UP_UNCLEAR, TOO_COARSE),
     )

@@ -28,7 +28,9 @@ _HIGHEST, _WIDEST = 150.0, 400.0
 #: Lowest height of a plot with stems to breast height [m].
 _LOWEST = 0.5
 #: Steps of the coordinates that blur a diameter, and that leave no stem [m].
-_COARSE, _TOO_COARSE = 0.02, 0.1
+_COARSE, _BLURRED, _LEAVES_NONE = 0.02, 0.05, 0.1
+#: First words of the warning about steps above _BLURRED [m], after which stems are missing.
+TOO_COARSE = "the coordinates are too coarse for diameters"
 #: Coordinates this large are those of a country, which has z up [m].
 _NATIONAL = 10_000.0
 
@@ -300,12 +302,15 @@ def _check_steps(metres: Float, warnings: list[str]) -> None:
     words = (
         f"its coordinates, as large as {np.abs(metres).max():,.0f} m, are in steps of {100.0 * step:.0f} cm"
     )
-    if step > _TOO_COARSE:
+    if step > _LEAVES_NONE:
         raise ScanFileError(
             f"{words}, which leaves no stems",
             "Export it again with 64-bit numbers or more digits, or with a shift",
         )
-    warnings.append(f"{words}: diameters are uncertain; export it with 64-bit numbers, or with a shift")
+    doubt = f"{TOO_COARSE}: " if step > _BLURRED else ""
+    warnings.append(
+        f"{doubt}{words}: diameters are uncertain; export it with 64-bit numbers, or with a shift"
+    )
 
 
 # --- reference systems ---------------------------------------------------------------------------------

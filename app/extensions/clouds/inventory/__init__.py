@@ -56,6 +56,9 @@ LEAST_RADIUS = 0.02  # m; smaller circles are twigs
 THINNER = 0.01  # m; by which the radius of a stem is smaller a metre or two above breast height
 #: First words of the warning about a cloud narrower than NARROW [m] and more than LONG_SIDE times as long.
 SECTION = "the cloud is a section through a plot"
+#: First words of the warning about a cloud that is lower than BREAST_HEIGHT [m] and has little ground.
+SLICE = "the cloud is a slice of stems without ground"
+BREAST_HEIGHT, LITTLE_GROUND = 1.3, 0.1
 NARROW, LONG_SIDE = 0.5, 4.0  # stems are as thick, and the cloud of a single one is as wide as long
 #: The highest tree that is known [m] (a coast redwood, 2019), and the distance from equator to pole [m],
 #: which no northing in metres exceeds.
@@ -386,8 +389,14 @@ def _warnings(cloud: WholeCloud, points: PlotPoints) -> tuple[str, ...]:
             f"{SECTION}, only {narrow:.2f} m wide and {long:.1f} m long: its sides cut the stems, which "
             "are missing or have no diameter"
         )
+    high = float(points.voxels.points[:, 3].max(initial=0.0))
+    if high < BREAST_HEIGHT and points.ground.seen.mean() < LITTLE_GROUND:
+        warnings.append(
+            f"{SLICE}, {high:.1f} m high: heights above the ground are unknown, so no stem is measured at "
+            "breast height; export it with the ground, or from 0.5 to 2.5 m above it"
+        )
     if len(points.slices.xy) == 0:
         warnings.append("there are no points higher than 0.2 m above the lowest returns")
-    if points.ground.seen.mean() < 0.1:
+    if points.ground.seen.mean() < LITTLE_GROUND:
         warnings.append("the ground is visible in less than 10 % of the plot: heights are uncertain")
     return tuple(warnings)

@@ -16,7 +16,7 @@ from app.cli import main
 from app.extensions.clouds.inventory import _unit_doubt
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.cloud_frame import UNNAMED, metric_crs
+from pipeline.io.readers.cloud_frame import TOO_COARSE, UNNAMED, metric_crs
 from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.up_axis import UP, UP_UNCLEAR
 from pipeline.types.records import CloudDescription
@@ -243,6 +243,14 @@ def test_national_coordinates_that_lost_their_digits_are_refused(tmp_path, point
         open_cloud(ply(tmp_path / "c.ply", high, "float"))
     found, _ = read(ply(tmp_path / "c.ply", high, "double"))
     np.testing.assert_allclose(found, high, atol=1e-3)
+
+
+@pytest.mark.parametrize(("step", "is_too_coarse"), [(0.04, False), (0.1, True)])
+def test_coordinates_whose_steps_hide_the_stems_are_told(tmp_path, points, step, is_too_coarse):
+    _, about = read(ply(tmp_path / "c.ply", np.round(points / step) * step, "double"))
+    assert [text.startswith(TOO_COARSE) for text in about.warnings if "in steps of" in text] == [
+        is_too_coarse
+    ]
 
 
 @pytest.mark.parametrize("up", ["y", "-y", "x", "-x", "-z"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.extensions.clouds.inventory import SECTION, map_plot
+from app.extensions.clouds.inventory import SECTION, SLICE, map_plot
 from app.extensions.clouds.inventory.cross_sections import upper_end
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.config import preset
@@ -145,6 +145,16 @@ def test_a_section_through_a_plot_is_told(wide, turn, is_section):
     points[:, :2] = points[:, :2] @ np.array([[c, s], [-s, c]])
     m = map_plot(Made(points), FOREST)
     assert any(text.startswith(SECTION) for text in m.warnings) == is_section
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "is_slice"), [(1.2, 1.4, True), (1.0, 1.6, True), (0.5, 2.5, False), (-1.0, 1.0, False)]
+)
+def test_a_slice_of_stems_without_ground_is_told(low, high, is_slice):
+    points = plot(np.random.default_rng(9))
+    above = points[:, 2] - hill(points[:, 0], points[:, 1])
+    m = map_plot(Made(points[(above > low) & (above < high)]), FOREST)
+    assert any(text.startswith(SLICE) for text in m.warnings) == is_slice
 
 
 @pytest.mark.parametrize(("radius", "height"), [(0.3, 0.9), (0.95, 0.9), (0.3, 1.2)])
