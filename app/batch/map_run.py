@@ -40,6 +40,7 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import MapScores, PathError, path_error
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers.base import Source
+from pipeline.io.readers.ros import RosSource
 from pipeline.io.result_files import ODOMETRY, RunFiles, seen_text, terrain_text, tum_text
 from pipeline.jit import on_compiling
 from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
@@ -50,6 +51,7 @@ from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.repairs.record import Repair, repairs_record, repairs_words, unapplied
 from pipeline.repairs.repaired import MapOfRun, Repairer
 from pipeline.seen_area import SeenArea, SeenRecorder, ViewSelection
+from pipeline.slam.slip_detection import SLIPPED
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
 MEASURED_SCANS = 100_000  # whose times enter the medians
@@ -155,7 +157,8 @@ def _map(
         files: Output files.
         stopwatch: Measures the stages.
     """
-    moving, chosen = with_odometry(plan.source, plan.odometry)
+    recorded = plan.source
+    moving, chosen = with_odometry(recorded, plan.odometry)
     plan = replace(plan, source=moving)
     description = plan.source.description
     mapper = mapper_of(description, plan.parameters, plan.seed, stopwatch)
@@ -179,6 +182,9 @@ def _map(
     state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
     if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
         tally.warned[far_truth(evaluation.reach)] += 1
+    is_slipping = any(DOUBTFUL in text and SLIPPED in text for text in tally.warned)
+    if is_slipping and isinstance(recorded, RosSource) and (wrong := recorded.contradiction_of_mounting()):
+        tally.warned[wrong] += 1
     if unconfirmed := unconfirmed_warning(frame, plan.parameters):
         tally.warned[unconfirmed] += 1
     if left_out_words := left_out_warning(losses, frame.index + 1):

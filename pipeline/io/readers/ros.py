@@ -21,7 +21,7 @@ from pipeline.io.readers.robot_body import body_words
 from pipeline.io.readers.ros_description import RosOpening, describe
 from pipeline.io.readers.ros_first_scans import find_first_scan, times_of_topic
 from pipeline.io.readers.ros_messages import Content, TimedMessages
-from pipeline.io.readers.ros_mounting import find_mounting
+from pipeline.io.readers.ros_mounting import contradiction_of_yaw, find_mounting
 from pipeline.io.readers.ros_odometry import choose_odometry, first_frames, nearness
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.ros_tilt import TiltCheck, check_tilt, spread_scans
@@ -179,8 +179,11 @@ class RosSource(MessageSource):
         if not live and not odometry.world and sensor.rings != 1:
             is_recorded = mounting.base != found.frame and tree.find(mounting.base, found.frame) is not None
             is_recorded = is_recorded and not mounting.is_measured and options.T_base_lidar is None
+            blamed = "the fixed transform is wrong" if is_recorded else ""
+            if mounting.is_assumed:
+                blamed = f"no fixed transform from {found.frame or 'the LiDAR'} to {mounting.base} tells it"
             scans_of_run = spread_scans(messages, decoder, found.frame, T_base_lidar)
-            tilt = check_tilt(messages, decoder, scans_of_run, is_recorded=is_recorded)
+            tilt = check_tilt(messages, decoder, scans_of_run, blamed)
             body = body_words([points for _, points in scans_of_run])
         if tilt.scans:
             count_loss(self._damage, tilt.reason, tilt.scans)
@@ -191,7 +194,7 @@ class RosSource(MessageSource):
         self._alignments = FrameAlignments(decoder, messages)
         self._description = self._alignments.begin(described, live=live)
         self.notices = self._alignments.notices
-        self.base, self._reader = mounting.base, reader
+        self.base, self._reader, self._mounting = mounting.base, reader, mounting
         self._offset_ns = messages.clock.offset_ns
         self._picture_channels = {number: channels[number] for number in odometry.topics.numbers("camera")}
         # A live run starts again with its first message: another clock than that of the opening.
@@ -217,6 +220,11 @@ class RosSource(MessageSource):
             for stamped in self._reader.messages.times_of(self._live_clock, message, losses):
                 self._alignments.add(stamped)
                 yield from self._reader.decode(stamped, self._live_frames, losses)
+
+    def contradiction_of_mounting(self) -> str:
+        """Return a message if the motion of the scans contradicts the yaw of the fixed transforms, see
+        `contradiction_of_yaw`; for a map that contradicts the odometry."""
+        return contradiction_of_yaw(self._mounting, self._reader.messages, self._reader.decoder)
 
     def truth(self) -> Truth | None:
         """Return the ground truth attached to a simulated recording, None when there is none."""

@@ -4,10 +4,11 @@ the scans beside the odometry."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.geometry.poses import Float, Pose3
+from pipeline.geometry.poses import Float, Pose3, wrap_angle
 from pipeline.io.readers.base import SourceOptions
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.mounting import mounting_by_ground, mounting_by_grounds, tilt_text
@@ -19,6 +20,9 @@ from pipeline.io.readers.topics import Topics
 from pipeline.io.readers.transforms import Extrinsics, TransformTree
 from pipeline.types.records import Int, Odometry, Scan
 
+if TYPE_CHECKING:
+    from pipeline.odometry.mounting_yaw import MountingYaw
+
 #: Path by which the yaw of a mounting is found, and how far the robot is from its start when it begins [m].
 _MOTION, _BEGUN = 5.0, 0.2
 #: Most readings and scans that are read for it.
@@ -26,6 +30,8 @@ _MOST_READINGS, _MOST_SCANS = 60_000, 400
 #: Number of scans by which the tilt of a LiDAR is found, and least share of points that must fit to the map
 #: of the scans before, for their motion to be known.
 _LEVELS, _SAME_WORLD = 5, 0.5
+#: A yaw by the motion that differs less from a stated one may be the error of the registration [rad].
+_OTHER_YAW = np.radians(15.0)
 #: Words in usual names of frames of LiDARs.
 _LIDAR_WORDS = ("lidar", "velodyne", "livox", "laser", "hesai", "pandar", "os_sensor", "ouster", "rslidar")
 
@@ -166,7 +172,7 @@ def _mounting_by_motion(
         level: T_base_lidar by the ground in the first scan, None for an upright LiDAR.
     """
     # Compiled kernels and SciPy, which a process that only records or serves does not need.
-    from pipeline.odometry.mounting_yaw import better_yaw, lidar_path, overlap, yaw_of_mounting
+    from pipeline.odometry.mounting_yaw import better_yaw
 
     times_ns, path = _odometry_path(messages, decoder)
     if len(times_ns) < 2:
@@ -178,11 +184,9 @@ def _mounting_by_motion(
     if level is None:
         level = mounting_by_grounds(scans[:: len(scans) // _LEVELS])
         warnings = () if level is None else (tilt_text(level),)
-    stamps = np.array([scan.stamp_ns for scan in scans], np.int64)
-    at = np.column_stack([np.interp(stamps - times_ns[0], times_ns - times_ns[0], c) for c in path.T])
-    by_scans, points = lidar_path(scans, level or Pose3.identity())
-    found = yaw_of_mounting(by_scans, at)
-    if found is None or overlap(by_scans, points) < _SAME_WORLD:
+    at = _poses_at(scans, times_ns, path)
+    found, points = _yaw_by_motion(scans, at, level or Pose3.identity())
+    if found is None:
         return _Motion(level, 0, warnings)
     yaw = better_yaw(found.yaw, at, points)
     degrees = round(float(np.degrees(yaw))) % 360
@@ -194,6 +198,60 @@ def _mounting_by_motion(
     )
     T_base_lidar = Pose3.from_euler(np.zeros(3), 0.0, 0.0, yaw) @ (level or Pose3.identity())
     return _Motion(T_base_lidar, 0, (*warnings, text))
+
+
+def _poses_at(scans: list[Scan], times_ns: Int, path: Float) -> Float:
+    """Return the poses of the odometry at the times of scans, shape (N, 3), see `_odometry_path`."""
+    stamps = np.array([scan.stamp_ns for scan in scans], np.int64)
+    return np.column_stack([np.interp(stamps - times_ns[0], times_ns - times_ns[0], c) for c in path.T])
+
+
+def _yaw_by_motion(scans: list[Scan], at: Float, level: Pose3) -> tuple[MountingYaw | None, list[Float]]:
+    """Return the yaw of the LiDAR (None if the scans do not show it) and the registered points.
+
+    Args:
+        scans: Consecutive scans.
+        at: From `_poses_at`.
+        level: Tilt of the LiDAR.
+    """
+    from pipeline.odometry.mounting_yaw import lidar_path, overlap, yaw_of_mounting
+
+    by_scans, points = lidar_path(scans, level)
+    found = yaw_of_mounting(by_scans, at)
+    return (None if found is None or overlap(by_scans, points) < _SAME_WORLD else found), points
+
+
+def contradiction_of_yaw(mounting: Mounting, messages: TimedMessages, decoder: RecordDecoder) -> str:
+    """Return a message if the motion of the scans beside the odometry contradicts the yaw of the mounting by
+    the fixed transforms or the user; "" if it does not, or does not show the yaw. It takes about a second.
+
+    Args:
+        mounting: The mounting.
+        messages, decoder: The messages and their decoder.
+
+    Raises:
+        SourceError: The recording cannot be read.
+    """
+    if mounting.T_base_lidar is None or mounting.is_measured or not mounting.odometry.is_known:
+        return ""
+    stated = float(mounting.T_base_lidar.euler()[2])
+    level = Pose3.from_euler(np.zeros(3), 0.0, 0.0, -stated) @ mounting.T_base_lidar
+    times_ns, path = _odometry_path(messages, decoder)
+    if len(times_ns) < 2:
+        return ""
+    scans = _scans_between(messages, decoder, mounting.lidar, int(times_ns[0]), int(times_ns[-1]))
+    if len(scans) < _LEVELS:
+        return ""
+    found, _ = _yaw_by_motion(scans, _poses_at(scans, times_ns, path), level)
+    if found is None or found.contradicts or abs(float(wrap_angle(found.yaw - stated))) < _OTHER_YAW:
+        return ""
+    degrees = [round(float(np.degrees(yaw))) for yaw in (found.yaw, stated)]
+    frames = f"{mounting.base or 'the base'} to {mounting.lidar or 'the LiDAR'}"
+    return (
+        f"the transform from {frames} has a wrong yaw, or is inverted: by the motion of the scans beside the "
+        f"odometry over {found.length:.0f} m it is {degrees[0]} degrees, and not {degrees[1]}; give the pose "
+        "of the LiDAR with --mount"
+    )
 
 
 def _is_of_another_robot(topics: Topics) -> bool:

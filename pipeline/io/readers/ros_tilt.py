@@ -67,7 +67,7 @@ def spread_scans(
 
 
 def check_tilt(
-    messages: TimedMessages, decoder: RecordDecoder, scans: list[tuple[int, Float]], *, is_recorded: bool
+    messages: TimedMessages, decoder: RecordDecoder, scans: list[tuple[int, Float]], blamed: str
 ) -> TiltCheck:
     """Check whether scans are level by the fixed transforms and the orientation of the IMU.
 
@@ -78,7 +78,8 @@ def check_tilt(
     Args:
         messages, decoder: The messages and their decoder, with the base frame.
         scans: From `spread_scans`.
-        is_recorded: Whether the mounting is that of fixed transforms.
+        blamed: What is wrong if a mounting by fixed transforms, or without any, is not level; "" if the user
+            states the mounting, or the odometry is that of the LiDAR.
     """
     numbers = messages.odometry.topics.numbers("imu")
     levelling = [_levelling_near(messages, decoder, numbers, log_ns) for log_ns, _ in scans]
@@ -104,13 +105,13 @@ def check_tilt(
                 "they do not without it: the orientation is not used",
             ),
         )
-    if not (is_recorded or has_imu) or not tilt or _mean_of(grounds) @ _mean_of(trunks) < np.cos(_ALIKE):
+    if not (blamed or has_imu) or not tilt or _mean_of(grounds) @ _mean_of(trunks) < np.cos(_ALIKE):
         return TiltCheck()
-    wrong = f"the orientation in {imu} or the fixed transforms are" if imu else "the fixed transform is"
+    wrong = f"the orientation in {imu} or the fixed transforms are wrong" if imu else blamed
     return TiltCheck(
         messages.odometry.topics.chosen["scan"].count,
         f"tilts of scans whose ground and trunks are tilted by {np.degrees(tilt):.0f} degrees in the same "
-        f"direction throughout the drive: {wrong} wrong; give the pose of the LiDAR with --mount",
+        f"direction throughout the drive: {wrong}; give the pose of the LiDAR with --mount",
     )
 
 

@@ -19,13 +19,19 @@ from tests.pipeline.io.recordings import START_NS, Author, Write, write_recordin
 STEP_NS = 1_000_000_000
 
 
-def recorded(folder: Path, scenario: str, T_base_lidar: Pose3, orientation: Pose3 | None = None) -> Path:
-    """A recording of a drive whose fixed transform places the LiDAR upright, 0.8 m high, with an IMU of a
-    constant orientation, or none."""
+def recorded(
+    folder: Path,
+    scenario: str,
+    T_base_lidar: Pose3,
+    orientation: Pose3 | None = None,
+    child: str = "velodyne",
+) -> Path:
+    """A recording of a drive whose fixed transform places the LiDAR, or another child, upright, 0.8 m high,
+    with an IMU of a constant orientation, or none."""
     run = replace(open_simulated(scenario).run, lidar=SpinningLidar(), T_base_lidar=T_base_lidar)
 
     def fill(author: Author, write: Write) -> None:
-        link = ("base_link", "velodyne", (0.0, 0.0, 0.8, 0.0))
+        link = ("base_link", child, (0.0, 0.0, 0.8, 0.0))
         write("/tf_static", "tf2_msgs/msg/TFMessage", START_NS, author.transforms(START_NS, link))
         for k in range(8):
             now_ns, scan = START_NS + k * STEP_NS, run.sweep(10 * k).scan
@@ -59,6 +65,12 @@ def test_a_fixed_transform_without_the_tilt_of_the_lidar_is_contradicted_by_the_
     assert scans == 8
     assert left_out_warning(source.losses, scans) == "", "they are mapped"
     assert "--mount" in reason
+
+
+def test_a_lidar_without_a_transform_whose_tilt_is_not_found_is_told(tmp_path: Path, opened: Opened):
+    source = opened(recorded(tmp_path, "sim:paper?duration=10", tilted(0, 12), child="lidar_link"))
+    list(source.records())
+    assert any("no fixed transform from velodyne to base_link tells it" in reason for reason in source.losses)
 
 
 @pytest.mark.parametrize("scenario", ["sim:stand?duration=10", "sim:slope?duration=10"])

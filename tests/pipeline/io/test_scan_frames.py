@@ -13,6 +13,7 @@ import pytest
 
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers import Source
+from pipeline.io.readers.ros import RosSource
 from pipeline.odometry.mounting_yaw import yaw_of_mounting
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
@@ -257,6 +258,24 @@ def test_the_yaw_of_a_mounting_is_found_by_its_motion(degrees: int, tmp_path: Pa
     assert abs((found - degrees + 180.0) % 360.0 - 180.0) < 2.0
     assert any("yaw of the mounting" in w for w in source.description.warnings) is (degrees != 0)
     assert not source.losses
+
+
+@pytest.mark.parametrize(("degrees", "stated"), [(90, 0), (60, -60), (90, 90), (33, 30)])
+def test_a_fixed_transform_with_another_yaw_than_the_motion_is_told(
+    degrees: int, stated: int, tmp_path: Path, opened: Opened
+):
+    def fill(author: Author, write: Write) -> None:
+        fixed = author.transforms(START_NS, ("base_link", "velodyne", (0.3, -0.1, 0.0, math.radians(stated))))
+        write("/tf_static", TRANSFORMS, START_NS, fixed)
+        unlinked(math.radians(degrees))(author, write)
+
+    source = opened(write_recording("mcap", tmp_path, fill))
+    assert isinstance(source, RosSource)
+    text = source.contradiction_of_mounting()
+    assert bool(text) is (abs(degrees - stated) > 15)
+    if text:
+        assert text.startswith("the transform from base_link to velodyne has a wrong yaw")
+        assert f"and not {stated};" in text
 
 
 def test_odometry_of_a_robot_that_stands_contradicts_scans_that_move(tmp_path: Path, opened: Opened):
