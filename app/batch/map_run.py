@@ -27,6 +27,7 @@ from app.batch.summary import (
     start_lines,
     summary_lines,
     unconfirmed_warning,
+    unread_scans,
 )
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
@@ -202,6 +203,7 @@ def _map(
         summary=[
             *summary_lines(description.uri, frame, (seconds, metres), evaluation, error),
             f"odometry: {chosen.words}",
+            *unread_scans(description.topics),
             preset_words(plan.preset, plan.parameters),
             *([repairs_words(plan.repairs, repaired.problems)] if plan.repairs else []),
             *start_lines(begun.sources[-1]),

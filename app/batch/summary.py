@@ -18,6 +18,7 @@ from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
 
 if TYPE_CHECKING:
     from app.batch.saved_run import RunSource
+    from pipeline.io.readers.base import RecordedTopic
 
 
 #: Reason of points of a cloud that are left out.
@@ -407,6 +408,13 @@ def _metres(value: float | None) -> str:
 def _pair(value: float | None) -> str:
     """Return a pair error [%] as text; "-" for None."""
     return "-" if value is None else f"{value:.2f} %"
+
+
+def unread_scans(topics: Iterable[RecordedTopic]) -> list[str]:
+    """Return a line that names the further topics of scans of a recording, which are not read; [] without
+    any."""
+    unread = [topic.name for topic in topics if topic.fits == "scan" and not topic.read_as and topic.messages]
+    return [f"not read: {', '.join(unread)}, further scans; --topic scan=NAME maps another"] * bool(unread)
 
 
 def start_lines(last: RunSource) -> list[str]:

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.batch.saved_run import RunSource
-from app.batch.summary import breaks_of, driven, left_out_warning
+from app.batch.summary import breaks_of, driven, left_out_warning, unread_scans
+from pipeline.io.readers.base import RecordedTopic
 from pipeline.types.records import Path
 
 STEP = st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.integers(1, 10**10))
@@ -44,3 +45,13 @@ def test_only_scans_that_are_not_mapped_count_as_left_out():
     """LiDAR odometry may not place a scan; the scan is mapped nevertheless."""
     assert left_out_warning({"poses of scans that LiDAR odometry could not place": 2}, 4) == ""
     assert "2 of 6 scans" in left_out_warning({"scans without points": 2}, 4)
+
+
+def test_a_second_lidar_that_is_not_read_is_named():
+    points, cloud = ("sensor_msgs/msg/PointCloud2", 100), RecordedTopic
+    read, second = cloud("/front/points", *points, "scan", "scan"), cloud("/rear/points", *points, "", "scan")
+    empty = cloud("/old/points", points[0], 0, "", "scan")
+    assert unread_scans([read, empty]) == []
+    (line,) = unread_scans([read, second, empty])
+    assert line.startswith("not read: /rear/points, ")
+    assert "--topic scan=NAME" in line
