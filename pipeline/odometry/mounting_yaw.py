@@ -102,10 +102,10 @@ def _height_above_cell(points: Float | Float32) -> Float32:
     if not len(points):
         return np.zeros(0, np.float32)
     cell = np.floor(points[:, :2] / _CELL).astype(np.int64)
-    _, which = np.unique(cell, axis=0, return_inverse=True)
+    _, which = np.unique((cell[:, 0] << 32) + cell[:, 1], return_inverse=True)
     lowest = np.full(int(which.max()) + 1, np.inf)
-    np.minimum.at(lowest, which.ravel(), points[:, 2])
-    height: Float32 = (points[:, 2] - lowest[which.ravel()]).astype(np.float32)
+    np.minimum.at(lowest, which, points[:, 2])
+    height: Float32 = (points[:, 2] - lowest[which]).astype(np.float32)
     return height
 
 

@@ -41,6 +41,10 @@ CONTRADICTION = (
     "motions of scans that contradict the odometry: it is of another robot, or its wheels slip, and "
     "the map may be wrong; --odometry lidar uses the scans alone"
 )
+ON_ITS_SIDE = (
+    "motions of scans of a LiDAR that lies on its side by the ground: they do not show its yaw well; give "
+    "its pose with --mount"
+)
 #: Number of IMU messages in which an orientation is looked for.
 _TRIES = 20
 #: Cosine of the tilt of a robot above which an IMU has other axes: these differ by 90 or 180 degrees, and no
@@ -160,7 +164,9 @@ class RosSource(MessageSource):
         if median_range(found.scan) > FARTHEST_MEDIAN:
             count_loss(self._damage, NO_METRES, scans.count)
         mounting = find_mounting(found, odometry, extrinsics, messages, decoder, options, live=live)
-        if mounting.contradicting:
+        if mounting.is_assumed and mounting.T_base_lidar and abs(mounting.T_base_lidar.R[2, 2]) < _UPRIGHT:
+            count_loss(self._damage, ON_ITS_SIDE, scans.count)
+        elif mounting.contradicting:
             count_loss(self._damage, CONTRADICTION, mounting.contradicting)
         if mounting.odometry is not odometry:
             messages = TimedMessages(container, extrinsics, mounting.odometry, decoder.times.values())

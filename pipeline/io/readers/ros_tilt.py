@@ -84,16 +84,13 @@ def check_tilt(
     numbers = messages.odometry.topics.numbers("imu")
     levelling = [_levelling_near(messages, decoder, numbers, log_ns) for log_ns, _ in scans]
     has_imu = any(R is not None for R in levelling)
-    unlevelled, trunks, grounds = list[Float](), list[Float](), list[Float]()
-    for (_, points), R_level_base in zip(scans, levelling, strict=True):
-        if (R_level_base is None and has_imu) or (up := _up_of(points)) is None:
-            continue
-        R = np.eye(3) if R_level_base is None else R_level_base
-        unlevelled.append(up)
-        trunks.append(R @ up)
-        if (ground := _ground_of(points, up)) is not None:
-            grounds.append(R @ ground)
-    lean, tilt = _common_tilt(trunks), _common_tilt(grounds)
+    seen = [
+        (np.eye(3) if R is None else R, points, up)
+        for (_, points), R in zip(scans, levelling, strict=True)
+        if (R is not None or not has_imu) and (up := _up_of(points)) is not None
+    ]
+    unlevelled, trunks = [up for _, _, up in seen], [R @ up for R, _, up in seen]
+    lean = _common_tilt(trunks)
     if not lean:
         return TiltCheck()
     imu = messages.odometry.topics.chosen["imu"].name if has_imu else ""
@@ -105,6 +102,8 @@ def check_tilt(
                 "they do not without it: the orientation is not used",
             ),
         )
+    grounds = [R @ normal for R, points, up in seen if (normal := _ground_of(points, up)) is not None]
+    tilt = _common_tilt(grounds)
     if not (blamed or has_imu) or not tilt or _mean_of(grounds) @ _mean_of(trunks) < np.cos(_ALIKE):
         return TiltCheck()
     wrong = f"the orientation in {imu} or the fixed transforms are wrong" if imu else blamed

@@ -10,6 +10,7 @@ import pytest
 
 from app.batch.summary import left_out_warning
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.ros import CONTRADICTION, ON_ITS_SIDE
 from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.lidar import SpinningLidar
 from pipeline.types.records import Imu
@@ -123,3 +124,11 @@ def test_an_upright_lidar_is_read_rather_than_one_that_turns_about_a_horizontal_
 
     described = opened(write_recording("mcap", tmp_path, fill)).description
     assert [topic.name for topic in described.topics if topic.read_as == "scan"] == ["/upright"]
+
+
+def test_a_lidar_on_its_side_is_named_rather_than_the_odometry(tmp_path: Path, opened: Opened):
+    source = opened(recorded(tmp_path, "sim:stand?duration=10", tilted(90, 0), child="lidar_link"))
+    list(source.records())
+    assert source.description.T_base_lidar.R[2, 2] < 0.1
+    assert ON_ITS_SIDE in source.losses
+    assert CONTRADICTION not in source.losses
