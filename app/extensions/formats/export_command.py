@@ -18,9 +18,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the flags of the folder."""
     group = parser.add_argument_group(
         "--to tree-manager (default)",
-        "TreeManagerState_<i>.csv with the trees around each pose, and trajectory.txt, the exchange format "
-        "of place recognition by stems. `stemmap map FOLDER` reads it. Exit code 3: some trees are too far "
-        "from the path to be in any frame.",
+        "TreeManagerState_<i>.csv with the trees around each pose, and trajectory.txt, the exchange\n"
+        "format of place recognition by stems. `stemmap map FOLDER` reads it.\n"
+        "Exit code 3: some trees are too far from the path to be in any frame.",
     )
     group.add_argument(
         "--out", metavar="FOLDER", type=Path, help="new or empty folder, only for tree-manager"
