@@ -121,7 +121,9 @@ class SimulatedRun:
     def digest(self) -> str:
         """Return the SHA-256 (hex) of everything that decides the bytes of the run."""
         request, scenario = self.request, self.request.scenario
-        text = f"stemmap simulation {VERSION}; {request}; {scenario}; {self._mounting()}"
+        # Annotations are stored under the digest, so its text has the two fields that a request once had.
+        words = str(request).removesuffix(")") + ", file='', truth='')"
+        text = f"stemmap simulation {VERSION}; {words}; {scenario}; {self._mounting()}"
         text += f"; drive {request.drive}" if request.drive else ""
         text += f"; lidar {request.lidar}" if request.lidar else ""
         text += "; obeys" if scenario.obeys else ""

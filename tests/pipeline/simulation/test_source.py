@@ -157,3 +157,9 @@ def test_another_drive_goes_through_the_same_scene_with_other_noise():
     assert not np.array_equal(first.run.odometry, other.run.odometry)
     assert bytes_of(first.run.sweep(3).scan) == bytes_of(same.run.sweep(3).scan)
     assert bytes_of(first.run.sweep(3).scan) != bytes_of(other.run.sweep(3).scan)
+
+
+def test_the_digest_of_a_run_stays():
+    """Annotations are stored under it."""
+    digest = open_simulated("sim:stand").description.digest
+    assert digest == "20aaf691b64d334ac0964c25ce925c772bbfca80ff978965b9a7de70067222c5"
