@@ -27,6 +27,9 @@ REACH = 0.45  # m; maximum distance between a track and its column
 # m; scale of the distance between a trunk's track and the axis of its column: of the tracks that are the only
 # one in reach, 95 of 100 are within 0.16 m in sim:stand and within 0.12 m in sim:dense.
 OWN = 0.15
+# m; the surroundings that decide the class of a column contain the returns at the axis, 0.3 m around it, of
+# any stem nearer than this.
+SAME_CROWN = RING_FAR + 0.3
 NEIGHBOUR = 0.7  # m; a tree without a column of its own takes the class of a column this near
 DUE_NS = 5_000_000_000  # ns after the first observation, when a trunk within DUE_REACH has a column
 DUE_REACH = 10.0  # m
@@ -254,12 +257,12 @@ def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
 @compiled
 def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
-    to the axis. Several columns may be assigned to one stem.
+    to the axis.
 
     Each column in their order takes the track within REACH with the highest likelihood (see `_likeliest`)
-    that is not assigned yet. The class of a column depends on its surroundings, up to RING_FAR: at a column
-    without a track or with one without detections, but with a detected track in its surroundings
-    (`_detected_stem_near`), that track is the stem, and the column is its undergrowth or a branch.
+    that is not assigned yet. The class of a column depends on its surroundings: a column whose track has
+    fewer than `fewest` detections is a branch, a stake or undergrowth of a detected stem within SAME_CROWN
+    (`_detected_stem_near`), which becomes a tree, or of such a column within SAME_CROWN with more votes.
 
     Args:
         tracks: The tracks, changed in place.
@@ -272,38 +275,45 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """
     count = tracks.verdict.shape[0]
     taken, new, n = np.zeros(count, np.bool_), np.empty(trees.shape[0], np.int64), 0
-    cells, scale = cells_for(count), per_metre(RING_FAR)
+    cells, scale = cells_for(count), per_metre(SAME_CROWN)
     fill(cells, tracks.x, count, scale)
     at = np.empty(trees.shape[0], np.int64)
     for k in range(trees.shape[0]):
-        c = trees[k]
-        at[k] = _likeliest(tracks, taken, cells, scale, axis[c, 0], axis[c, 1])
-        if at[k] >= 0:
-            taken[at[k]] = True
+        t = at[k] = _likeliest(tracks, taken, cells, scale, axis[trees[k], 0], axis[trees[k], 1])
+        if t >= 0:
+            taken[t] = True
+            if tracks.hits[t] >= fewest:
+                tracks.verdict[t] = TREE
+    undetected = cells_for(axis.shape[0])
     for k in range(trees.shape[0]):
         t, c = at[k], trees[k]
-        if t < 0 or tracks.hits[t] == 0:
-            stem = _detected_stem_near(tracks, cells, scale, axis[c, 0], axis[c, 1], fewest)
-            t = stem if stem >= 0 else t
-        if t < 0:
-            new[n] = c
-            n += 1
+        x, y = axis[c, 0], axis[c, 1]
+        if t >= 0 and tracks.hits[t] >= fewest:
             continue
-        tracks.verdict[t] = TREE
-        if tracks.hits[t] == 0:  # a tree without detections is at its column
-            tracks.x[t, 0], tracks.x[t, 1] = axis[c, 0], axis[c, 1]
+        stem = _detected_stem_near(tracks, cells, scale, x, y, fewest)
+        if stem >= 0:
+            tracks.verdict[stem] = TREE
+        elif nearest_in(undetected, axis, x, y, SAME_CROWN, scale) < 0:
+            put_in(undetected, axis, c, scale)
+            if t < 0:
+                new[n] = c
+                n += 1
+                continue
+            tracks.verdict[t] = TREE
+            if tracks.hits[t] == 0:  # a tree without detections is at its column
+                tracks.x[t, 0], tracks.x[t, 1] = x, y
     found: Int = new[:n].copy()
     return found
 
 
 @compiled_borrowing
 def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
-    """Return the row of the track with most detections within RING_FAR of an axis that may be a stem
-    (`_may_be_stem`), the lowest row of equal ones; -1 for none.
+    """Return the row of the track with most detections within SAME_CROWN of an axis that is a tree or has no
+    class, the lowest row of equal ones; -1 for none.
 
     Args:
         tracks: The tracks.
-        cells, scale: Grid of the tracks for searches within RING_FAR, and its cells per metre.
+        cells, scale: Grid of the tracks for searches within SAME_CROWN, and its cells per metre.
         x, y: Position of the axis [m].
         fewest: Minimum number of detections.
     """
@@ -314,9 +324,9 @@ def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: f
         while t >= 0:
             dx, dy = x - tracks.x[t, 0], y - tracks.x[t, 1]
             if (
-                dx * dx + dy * dy < RING_FAR * RING_FAR
+                dx * dx + dy * dy < SAME_CROWN * SAME_CROWN
                 and tracks.hits[t] >= fewest
-                and _may_be_stem(tracks.verdict[t])
+                and (tracks.verdict[t] < 0 or tracks.verdict[t] == TREE)
                 and (
                     best < 0
                     or tracks.hits[t] > tracks.hits[best]
@@ -326,19 +336,6 @@ def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: f
                 best = t
             t = np.int64(cells.following[t])
     return int(best)
-
-
-@compiled_borrowing
-def _may_be_stem(verdict: int) -> bool:
-    """Return whether a track of a class can be the stem of a tree column near it: without class (negative),
-    tree, or a class by votes with AT_ROUND below 1. Classes that are not by votes (moving, too few voxels)
-    cannot."""
-    if verdict < 0 or verdict == TREE:
-        return True
-    for k in range(_KINDS.shape[0]):
-        if verdict == _KINDS[k]:
-            return bool(_AT_ROUND[k] < 1.0)
-    return False
 
 
 @compiled_borrowing
