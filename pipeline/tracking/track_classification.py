@@ -260,8 +260,8 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     to the axis.
 
     Each column in their order takes the track within REACH with the highest likelihood (see `_likeliest`)
-    that is not assigned yet. The class of a column depends on its surroundings: a column whose track has
-    fewer than `fewest` detections is a branch, a stake or undergrowth of a detected stem within SAME_CROWN
+    that is not assigned yet. The class of a column depends on its surroundings: a column without a track or
+    with one without detections is a branch, a stake or undergrowth of a detected stem within SAME_CROWN
     (`_detected_stem_near`), which becomes a tree, or of such a column within SAME_CROWN with more votes.
 
     Args:
@@ -282,13 +282,13 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
         t = at[k] = _likeliest(tracks, taken, cells, scale, axis[trees[k], 0], axis[trees[k], 1])
         if t >= 0:
             taken[t] = True
-            if tracks.hits[t] >= fewest:
+            if tracks.hits[t] > 0:
                 tracks.verdict[t] = TREE
     undetected = cells_for(axis.shape[0])
     for k in range(trees.shape[0]):
         t, c = at[k], trees[k]
         x, y = axis[c, 0], axis[c, 1]
-        if t >= 0 and tracks.hits[t] >= fewest:
+        if t >= 0 and tracks.hits[t] > 0:
             continue
         stem = _detected_stem_near(tracks, cells, scale, x, y, fewest)
         if stem >= 0:
@@ -300,8 +300,7 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
                 n += 1
                 continue
             tracks.verdict[t] = TREE
-            if tracks.hits[t] == 0:  # a tree without detections is at its column
-                tracks.x[t, 0], tracks.x[t, 1] = x, y
+            tracks.x[t, 0], tracks.x[t, 1] = x, y
     found: Int = new[:n].copy()
     return found
 

@@ -95,7 +95,8 @@ def test_what_has_a_column_that_is_no_tree_is_not_the_stem_of_a_column_beside_it
 @pytest.mark.parametrize(
     ("hits", "away", "trees"),
     [
-        ((20, ENOUGH - 1), SAME_CROWN - 0.01, [True, False]),
+        ((20, 0), SAME_CROWN - 0.01, [True, False]),
+        ((20, 1), SAME_CROWN - 0.01, [True, True]),
         ((20, 0), SAME_CROWN + 0.01, [True, True]),
         ((20, ENOUGH), 0.6, [True, True]),
         ((0, ENOUGH), SAME_CROWN - 0.01, [False, True]),
