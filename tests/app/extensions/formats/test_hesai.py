@@ -23,6 +23,7 @@ from pipeline.io.readers.sensor_families import HESAI_SCANS
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, Author, Write, write_recording
+from tests.pipeline.io.test_mounting import assert_not_levelled
 
 IDS = [model.name for model in MODELS]
 by_model = pytest.mark.parametrize("model", MODELS, ids=IDS)
@@ -253,3 +254,10 @@ def test_packets_in_a_recording_need_the_extension(
     monkeypatch.setenv(VARIABLE, "")
     with pytest.raises(SourceError, match="The extension formats is switched off"):
         opened(write_recording("mcap", tmp_path, fill_with(HESAI_SCANS[0], turn(MODELS[0]))))
+
+
+@pytest.mark.parametrize("folder", ["xt32", "40p"])
+def test_no_lidar_is_levelled_by_the_things_in_a_room(folder: str, shared_data: Path, opened: Opened):
+    here = shared_data / "hesai" / folder
+    inside = [path for path in here.iterdir() if path.is_dir()]
+    assert_not_levelled(opened(inside[0] if inside else here))
