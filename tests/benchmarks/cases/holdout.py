@@ -147,12 +147,13 @@ def _outcome(scene: Path, forest: Forest) -> MappingResult:
 
     frame, _, _ = mapped(str(scene), odometry="static", forest=forest)
     place = frame.trees.position[frame.trees.confirmed]
-    place = place[np.hypot(place[:, 0], place[:, 1]) <= REACH]
     points, label = labelled_points(scene)
     truth, any_trunk = trunks(points, label, 30, REACH), trunks(points, label, 1, np.inf)
     truth_of = match(place, truth, MATCH)
     nearest = np.hypot(*(place[:, None] - any_trunk[None]).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
-    false = (truth_of < 0) & (nearest > MATCH)
+    # A tree of the map beyond the limit can be a true one within it, whose error is between the two.
+    inside = np.hypot(place[:, 0], place[:, 1]) <= REACH
+    false = (truth_of < 0) & (nearest > MATCH) & inside
     found = np.isin(np.arange(len(truth)), truth_of).astype(np.float64)
     by_class = ByClass()
     by_class.add_labels(place[false], points, label)
