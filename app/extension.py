@@ -49,7 +49,8 @@ class Extension:
         page: Folder of JavaScript whose main.js registers parts of the dashboard, and runs.js parts of the
             page of runs (static/js/shell/extensions.js), with main.css and runs.css; each may be missing.
         formats: Returns formats of files and folders and their readers, which are tried after those of the
-            program, and of packets in ROS messages. If the extension is switched off, they are refused.
+            program (folders before), and of packets in ROS messages. If the extension is switched off, they
+            are refused.
         addresses: Dotted module by the scheme of the addresses of live sources. The module has `parse(uri)`,
             which returns an `app.sources.live_address.Address`, and `connect(address, inbox)`, which
             returns an `app.robot.link.Link`.

@@ -13,6 +13,7 @@ import numpy as np
 from app.common.text import count
 from pipeline.config import Parameters
 from pipeline.evaluation import MapScores, PathError, Rate
+from pipeline.io.readers import packet_formats
 from pipeline.map_faults import DOUBTFUL
 from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
 
@@ -411,9 +412,23 @@ def _pair(value: float | None) -> str:
 
 
 def unread_scans(topics: Iterable[RecordedTopic]) -> list[str]:
-    """Return a line that names the further topics of scans of a recording, which are not read; [] without
-    any."""
-    unread = [topic.name for topic in topics if topic.fits == "scan" and not topic.read_as and topic.messages]
+    """Return a line that names the topics of further LiDARs of a recording, which are not read; [] without
+    any. A topic in the frame of the one that is read has the same LiDAR."""
+    known = list(topics)
+    read = [topic for topic in known if topic.read_as == "scan"]
+    frames = {topic.frame for topic in read} - {""}
+    is_planar = any(topic.type.endswith("/LaserScan") for topic in read)
+    # Packets are those of a LiDAR whose clouds are read, except beside a planar one.
+    packets = {name for kind in packet_formats() for name in kind.msgtypes}
+    usable = {name for kind in packet_formats() if not kind.refusal for name in kind.msgtypes}
+    unread = [
+        topic.name
+        for topic in known
+        if topic.messages
+        and not topic.read_as
+        and topic.frame not in frames
+        and (is_planar and topic.type in usable if topic.type in packets else topic.fits == "scan")
+    ]
     return [f"not read: {', '.join(unread)}, further scans; --topic scan=NAME maps another"] * bool(unread)
 
 

@@ -24,7 +24,7 @@ SOURCE_HELP = (
     ".npy, .npz, .las, .laz), "
     "a whole cloud (.laz, .las, .ply, .npy, .npz), "
     "a live robot (zenoh:tcp/host:7447, velodyne:ADDRESS:PORT?from=SENSOR), "
-    "or a simulated run such as sim:stand"
+    "or a simulated run such as sim:stand; `stemmap extensions` names what extensions read"
 )
 
 

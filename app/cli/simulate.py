@@ -43,8 +43,10 @@ def run(arguments: argparse.Namespace) -> int:
         StemmapError: The scenario is invalid, a file exists without --force, or cannot be written.
     """
     from app.common.text import count
+    from app.sources.opening import open_source
+    from pipeline.errors import UsageError
     from pipeline.io.atomic_files import write_texts
-    from pipeline.io.readers.simulated import open_simulated
+    from pipeline.io.readers.simulated import SimulatedSource
     from pipeline.io.recording.mcap_writer import write_recording
     from pipeline.io.recording.rendering import CAMERA, with_pictures
     from pipeline.io.result_files import csv_text, number_text
@@ -53,7 +55,11 @@ def run(arguments: argparse.Namespace) -> int:
     table = out.with_suffix(".trees.csv")
     for file in (out, table):
         refuse_to_overwrite(file, force=arguments.force)
-    source = open_simulated(_uri(arguments))
+    source = open_source(_uri(arguments))
+    if not isinstance(source, SimulatedSource):
+        raise UsageError(
+            "no simulated run", where=_uri(arguments), remedy="Scenarios: `stemmap simulate --help`"
+        )
     description = source.description
     truth = source.truth()
     records: Iterator[Record | Picture] = _with_progress(source)

@@ -20,14 +20,15 @@ def _formats_of_extensions() -> list[Format | PacketFormat]:
     """Return the formats of the extensions; those of extensions that are switched off refuse their files.
     Those of an extension that fails to name them are left out, and this is logged."""
     found: list[Format | PacketFormat] = []
-    for each in all_extensions():
+    for each in sorted(all_extensions(), key=lambda each: not each.is_on):  # those that refuse come last
         if each.extension is None or each.extension.formats is None:
             continue
         try:
             for kind in each.extension.formats():
                 found.append(kind if each.is_on else replace(kind, refusal=switched_off(each.name)))
         except Exception:  # the code of others: other files can be opened without it
-            _log.exception("the formats of the extension %s are left out", each.name)
+            if each.is_on:
+                _log.exception("the formats of the extension %s are left out", each.name)
     return found
 
 

@@ -182,8 +182,10 @@ def check_address(uri: str) -> bool:
     if is_live(uri):
         parse_address(uri)
     elif uri.startswith(SCHEME) and not Path(uri).exists():
-        if format_of_address(uri) is None:
-            parse_uri(uri)
+        kind = format_of_address(uri)
+        check = parse_uri if kind is None else kind.check
+        if check is not None:
+            check(uri)
     else:
         check_existence(uri)
         return True

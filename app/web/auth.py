@@ -37,6 +37,8 @@ from pipeline.io.atomic_files import write_beside
 
 # The only route whose bodies may be as large as a recording.
 UPLOADS = "/api/uploads"
+#: What a viewer is told who asks for more, and what to do.
+VIEW_ONLY, ASK_OWNER = "this is a view-only link", "Ask the person who runs stemmap for the owner's link"
 # The only route without a token: for the supervisor of a service.
 HEALTH = "/health"
 Role = Literal["owner", "viewer"]
@@ -387,8 +389,8 @@ class Guard:
             return None
         return error_reply(
             403,
-            "this is a view-only link",
-            remedy="Ask the person who runs stemmap for the owner's link",
+            VIEW_ONLY,
+            remedy=ASK_OWNER,
         )
 
     def _limit_of(self, scope: Scope) -> int:

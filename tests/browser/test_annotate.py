@@ -476,8 +476,8 @@ def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
     person: Dashboard, chromium: Browser, server: Server
 ):
     page = person.page
-    page.locator("#annotate-name").fill("Ann")
-    page.locator("#annotate-name").press("Enter")
+    page.locator("#annotate-asked").fill("Ann")
+    page.locator("#annotate-asked").press("Enter")
     page.locator("#annotate-file").set_input_files(
         {"name": "plot.csv", "mimeType": "text/csv", "buffer": b"X,Y,dbh_cm\n1.5,30.5,22\n-4.0,31.0,\n"}
     )
@@ -513,8 +513,8 @@ def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser,
         person.tab("Annotate")
         person.page.locator("#map").press("s")
         person.answer("y")
-        person.page.locator("#annotate-name").fill("Ann")
-        person.page.locator("#annotate-name").press("Enter")
+        person.page.locator("#annotate-asked").fill("Ann")
+        person.page.locator("#annotate-asked").press("Enter")
         person.answer("y")
         expect(person.page.locator("#annotate-count")).to_contain_text("2 of")
         before = rows(person)

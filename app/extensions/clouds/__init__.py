@@ -22,12 +22,23 @@ def _open_drive(uri: str, path: Path, options: SourceOptions) -> Source:
     return open_drive(uri, path, options)
 
 
+def _check_drive(uri: str) -> None:
+    """Check the options of the address of a drive; UsageError if one is wrong."""
+    from app.extensions.clouds.drive_address import parse_drive
+
+    parse_drive(uri)
+
+
 @cache
 def _formats() -> tuple[Format, ...]:
     """Return the simulated drive through a cloud, by its address and for clouds that are opened as runs."""
     from pipeline.io.readers import Format
 
-    return (Format("a whole cloud", (), (), _open_drive, scheme="sim:cloud", scans_clouds=True),)
+    return (
+        Format(
+            "a whole cloud", (), (), _open_drive, scheme="sim:cloud", check=_check_drive, scans_clouds=True
+        ),
+    )
 
 
 def _add_routes(app: FastAPI) -> None:

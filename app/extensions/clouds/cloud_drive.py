@@ -20,10 +20,11 @@ from urllib.parse import urlencode
 
 import numpy as np
 
+from app.extensions.clouds.drive_address import parse_drive
 from app.extensions.clouds.plot_ground import ground_steps
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from app.sources.one_step import finish
-from pipeline.errors import SourceError, UsageError
+from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.ground_truth import read_truth_trees
 from pipeline.io.readers.base import SourceOptions
@@ -42,7 +43,7 @@ from pipeline.simulation.robot_motion import (
     lay_on_terrain,
 )
 from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, random_stream
-from pipeline.simulation.scenarios import OPTIONS, SCHEME, RunRequest, option_values
+from pipeline.simulation.scenarios import SCHEME, RunRequest
 from pipeline.simulation.scene import SimulatedScene
 from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees, WholeCloud
@@ -290,36 +291,6 @@ class CloudRun(SimulatedRun):
         version = f"{simulated.VERSION}.{VERSION}"
         text = f"stemmap cloud {version}; {request}; {self.source_digest}; {self._mounting()}"
         return hashlib.sha256(text.encode()).hexdigest()
-
-
-#: Options of the address `sim:cloud`.
-DRIVE_OPTIONS = {
-    "file": (str, "the cloud of a plot: .laz, .las, .ply, .npy, .npz or .pcd"),
-    "truth": (str, "a table (CSV) of its trees in the coordinates of the cloud"),
-    **{key: OPTIONS[key] for key in ("seed", "sigma", "odometry", "duration")},
-}
-
-
-def parse_drive(uri: str, seed: int = 0) -> tuple[str, str, RunRequest]:
-    """Return the file of the cloud, the table of its trees ("" for none), and the request of
-    `sim:cloud?file=FILE&key=value`. Its duration is 0, for one loop, if the URI has none.
-
-    Args:
-        uri: As the user wrote it; the part after "?" is percent-encoded.
-        seed: Seed of a URI that names none.
-
-    Raises:
-        UsageError: An option is unknown, given twice or out of bounds, or there is no file.
-    """
-    values = option_values(uri, uri.partition("?")[2], DRIVE_OPTIONS)
-    if not values.get("file"):
-        raise UsageError(
-            "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
-        )
-    name = uri.partition("?")[0].removeprefix(SCHEME)
-    quality = values.get("sigma", 0.02), values.get("odometry", "normal")
-    request = RunRequest(name, values.get("seed", seed), *quality, values.get("duration", 0.0), 0)
-    return values["file"], values.get("truth", ""), request
 
 
 def open_drive(uri: str, path: Path, options: SourceOptions) -> SimulatedSource:

@@ -97,6 +97,7 @@ def run(arguments: argparse.Namespace) -> int | None:
 def _runs_in(source: str) -> list[str]:
     """Return the names of the runs in a folder, without those of a slash at their end; [] if the source is a
     run itself, is no folder, or has one run, which is mapped as the source."""
+    import app.sources  # noqa: F401 - adds the formats of the extensions
     from pipeline.io.readers import folder_opener, folders_of_runs, path_of, recordings_in
 
     try:

@@ -50,9 +50,9 @@ def _formats() -> tuple[Format | PacketFormat, ...]:
             table=_later("e57", "open_e57"),
         ),
         format_of_points(
-            "whole cloud as text (.xyz, .txt, .asc, .csv, .pts)",
+            "whole cloud as text (.xyz, .txt, .asc, .csv, .pts, .ptx)",
             (),
-            *(".xyz", ".asc", ".pts", ".txt", ".csv"),
+            *(".xyz", ".asc", ".pts", ".ptx", ".txt", ".csv"),
             by_contents=False,
             table=_later("text_points", "open_text"),
             accepts=_later("text_points", "is_text_of_points"),

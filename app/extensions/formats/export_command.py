@@ -34,6 +34,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def check(arguments: argparse.Namespace) -> None:
+    """Raise UsageError if --out is given beside a file that --to names."""
+    if arguments.to not in (None, TREE_MANAGER) and arguments.out is not None:
+        raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
+
+
 def run(arguments: argparse.Namespace) -> int | None:
     """Write poses and trees of a mapped run to the new or empty folder --out.
 
@@ -41,12 +47,10 @@ def run(arguments: argparse.Namespace) -> int | None:
         Exit code: 3 if trees far from the path were left out, else 0; None for a file that --to names.
 
     Raises:
-        StemmapError: --out is missing, given for a file, not empty or cannot be written, the run cannot be
-            read, or it is no map of a drive.
+        StemmapError: --out is missing, not empty or cannot be written, the run cannot be read, or it is no
+            map of a drive.
     """
     if arguments.to not in (None, TREE_MANAGER):
-        if arguments.out is not None:
-            raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
         return None
     with reviewed(arguments.run) as folder:
         return _write(arguments, folder)

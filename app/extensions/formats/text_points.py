@@ -83,6 +83,8 @@ class _Layout:
 
 def is_text_of_points(head: bytes) -> bool:
     """Return whether a file is a text of points by its first HEAD bytes."""
+    if is_ptx(head):
+        return True
     if len(head) < HEAD and len(head.splitlines()) < LEAST_ROWS:
         return False
     try:

@@ -20,7 +20,7 @@ from urllib.parse import parse_qsl, urlencode
 import msgspec
 from fastapi import Depends
 from pydantic import Field
-from starlette.exceptions import HTTPException, WebSocketException
+from starlette.exceptions import WebSocketException
 from starlette.requests import HTTPConnection
 from starlette.responses import Response
 from starlette.status import WS_1013_TRY_AGAIN_LATER
@@ -31,7 +31,7 @@ from app.dashboard.dashboard import Dashboard
 from app.sources.request import FILE, SourceRequest
 from app.store.records import Author
 from app.store.store import Store
-from app.web.auth import Role, is_local, role_of
+from app.web.auth import ASK_OWNER, VIEW_ONLY, Role, is_local, role_of
 from app.web.responses import BadRequestError, Body, Number, UserName, json_reply
 from pipeline.errors import StemmapError
 from pipeline.io.readers import path_of
@@ -112,9 +112,9 @@ async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
 
 
 def _owner(connection: HTTPConnection) -> None:
-    """Raise 403 for a viewer."""
-    if role_of(connection.scope) == "viewer":
-        raise HTTPException(403, "this is a view-only link")
+    """Raise 403 for others than an owner; for requests, not for WebSockets."""
+    if role_of(connection.scope) != "owner":
+        raise NotPermittedError(VIEW_ONLY, remedy=ASK_OWNER)
 
 
 @asynccontextmanager

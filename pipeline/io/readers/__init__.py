@@ -176,7 +176,8 @@ def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
     """Open a whole cloud as a run of scans, by the format that does so; SourceError if there is none."""
     kind = next((kind for kind in formats() if kind.scans_clouds), None)
     if kind is None:
-        raise SourceError("a whole cloud has no scans", where=uri, remedy="Open it as a scan (--as scan)")
+        remedy = "Open it as a scan (--as scan, `SourceOptions.form`)"
+        raise SourceError("a whole cloud has no scans", where=uri, remedy=remedy)
     return opener_of(kind)(uri, path, options)
 
 
@@ -195,7 +196,9 @@ class Format:
         table: Opens the table of a file of points (`PointTable`); None for the formats of this package.
         accepts: Whether a file with these first bytes is of this format, for a format without magic bytes
             whose suffixes others have, too; None for other formats.
-        scheme: Beginning of the addresses that it opens, such as "sim:cloud"; "" for none.
+        scheme: Beginning of the addresses that it opens, such as "sim:cloud"; "" for none. Options `file` and
+            `truth` of such an address are files, which the dashboard lets only permitted people name.
+        check: Raises UsageError for an address with other options; None for no check.
         scans_clouds: Whether it opens whole clouds as runs of scans.
         is_folder: Whether a folder with files of these names is of this format; None for a format of files.
         refusal: Why it cannot be used, as the remedy of an error; "" if it can.
@@ -211,6 +214,7 @@ class Format:
     table: Callable[[Path], PointTable] | None = None
     accepts: Callable[[bytes], bool] | None = None
     scheme: str = ""
+    check: Callable[[str], object] | None = None
     scans_clouds: bool = False
     is_folder: Callable[[Collection[str]], bool] | None = None
     refusal: str = ""
@@ -366,10 +370,10 @@ def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
 
 def is_recording(path: Path) -> bool:
     """Return whether a file is a run or a cloud by its suffix, and where others have it, too, by its first
-    bytes; False for one that cannot be read."""
+    bytes; False for one that cannot be read, and for a format that cannot be used."""
     expected = expected_format(path)
-    if expected is None or expected.accepts is None:
-        return expected is not None
+    if expected is None or expected.refusal or expected.accepts is None:
+        return expected is not None and not expected.refusal
     try:
         return expected.accepts(_head_of(path))
     except OSError:
@@ -408,12 +412,13 @@ def named(names: list[str]) -> str:
 def folder_opener(folder: Path) -> Opener | None:
     """Return the opener of a folder by the names of the files in it, and of `velodyne/*.bin`; None if nothing
     in it can be read, or it has several ROS recordings without metadata.yaml, which are runs of their own.
-    Where several formats fit, the order is formats that were added, ROS recording, scans. OSError if the
-    folder cannot be read."""
+    Where several formats fit, the order is formats that were added, ROS recording, scans, added formats that
+    cannot be used. OSError if the folder cannot be read."""
     names = {path.name for path in folder.iterdir() if path.is_file()}
-    added = next((kind for kind in formats() if kind.is_folder is not None and kind.is_folder(names)), None)
-    if added is not None:
-        return opener_of(added)
+    added = [kind for kind in formats() if kind.is_folder is not None and kind.is_folder(names)]
+    usable = [kind for kind in added if not kind.refusal]
+    if usable:
+        return usable[0].open
     suffixes = [Path(name).suffix.lower() for name in names]
     bags = suffixes.count(".mcap") + suffixes.count(".db3")
     if bags > 1 and "metadata.yaml" not in names:
@@ -423,4 +428,6 @@ def folder_opener(folder: Path) -> Opener | None:
     inside = folder / "velodyne"
     is_kitti = inside.is_dir() and any(inside.glob("*.bin"))
     kinds = {".bin", ".pcd", ".ply", ".npy", ".npz", ".las", ".laz"}
-    return _scans if is_kitti or kinds.intersection(suffixes) else None
+    if is_kitti or kinds.intersection(suffixes):
+        return _scans
+    return opener_of(added[0]) if added else None

@@ -77,13 +77,13 @@ def open_points(path: Path) -> PointTable:
         return _open_las(path)
     if is_table(head[:16]):
         return open_table(path)
-    if suffix == ".bin":
-        return open_rows(path)
     kind = file_format(path, head) or expected_format(path)
     if kind is not None and kind.refusal:
         raise ScanFileError(f"{kind.words} needs an extension", kind.refusal)
     if kind is not None and kind.table is not None:
         return kind.table(path)
+    if suffix == ".bin":
+        return open_rows(path)
     if suffix in (".las", ".laz"):
         return _open_las(path)
     raise ScanFileError("not a file of points", readable())

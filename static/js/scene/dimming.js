@@ -11,10 +11,10 @@ const GREY = { dark: 0.05, light: 0.6 }; // near the ground of each theme
 // Each tree as the server has sent it, or grey if the filter leaves it out. The instances have the order of the trees of the map;
 // where the page has a newer map, a tree at another place keeps its colour.
 function paint(inner) {
-  const known = trees(), grey = isDark() ? GREY.dark : GREY.light;
-  return colourInstances(inner, "/world/trees", (k, { x, y, rgb }) => {
+  const known = trees(), grey = new Array(3).fill(isDark() ? GREY.dark : GREY.light);
+  return colourInstances(inner, "/world/trees", (k, x, y) => {
     const tree = known[k], isHere = tree && Math.abs(tree.x - x) < SAME && Math.abs(tree.y - y) < SAME;
-    return isHere && state.holds && !state.holds(tree) ? [grey, grey, grey] : rgb;
+    return isHere && state.holds && !state.holds(tree) ? grey : null;
   });
 }
 

@@ -1,4 +1,4 @@
-// The private parts of viser's client: only this file uses them. `inner` is the window of the frame that it runs in, null or an
+// The private objects of viser's client: only this file uses them. `inner` is the window of the frame that it runs in, null or an
 // error page of the browser where the scene failed to load.
 
 const WORLD = "/world"; // the node whose axes are those of the map
@@ -74,8 +74,9 @@ export function boundPointSizes(inner) {
   });
 }
 
-// Colours the instances of a node: rgb(k, sent) returns the colour [0 to 1] of instance k from what the server has sent.
-export function colourInstances(inner, name, rgb) {
+// Colours the instances of a node: colourOf(k, x, y) returns the colour [0 to 1] of instance k, which is at x, y; null for the
+// colour that the server has sent.
+export function colourInstances(inner, name, colourOf) {
   const sent = sentOf(inner, name);
   let mesh = null;
   nodeOf(inner, name)?.traverse((each) => { if (each.setColorAt) mesh ??= each; });
@@ -84,8 +85,9 @@ export function colourInstances(inner, name, rgb) {
   const at = read(Float32Array, sent.batched_positions), colours = read(Uint8Array, sent.batched_colors);
   const colour = mesh.material.color.clone();
   for (let k = 0; k < Math.min(at.length / 3, mesh.instancesCount); k += 1) {
-    const from = colours.length > 3 ? 3 * k : 0;
-    colour.setRGB(...rgb(k, { x: at[3 * k], y: at[3 * k + 1], rgb: [...colours.subarray(from, from + 3)].map((part) => part / 255) }));
+    const own = colourOf(k, at[3 * k], at[3 * k + 1]), from = colours.length > 3 ? 3 * k : 0;
+    if (own) colour.setRGB(...own);
+    else colour.setRGB(colours[from] / 255, colours[from + 1] / 255, colours[from + 2] / 255);
     mesh.setColorAt(k, colour);
   }
   return true;

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import app.sources  # noqa: F401 - adds the formats of packets
 from app.batch.saved_run import RunSource
 from app.batch.summary import breaks_of, driven, left_out_warning, unread_scans
 from pipeline.io.readers.base import RecordedTopic
@@ -55,3 +58,17 @@ def test_a_second_lidar_that_is_not_read_is_named():
     (line,) = unread_scans([read, second, empty])
     assert line.startswith("not read: /rear/points, ")
     assert "--topic scan=NAME" in line
+
+
+def test_topics_of_the_lidar_that_is_read_are_no_further_ones():
+    cloud = RecordedTopic("/points", "sensor_msgs/msg/PointCloud2", 100, "scan", "scan", frame="lidar")
+    packets = RecordedTopic("/packets", "velodyne_msgs/msg/VelodyneScan", 100, "", "scan", frame="lidar")
+    assert unread_scans([cloud, packets]) == []
+
+
+def test_packets_beside_a_planar_lidar_are_named():
+    planar = RecordedTopic("/scan", "sensor_msgs/msg/LaserScan", 100, "scan", "scan", frame="laser")
+    packets = RecordedTopic("/ouster/lidar_packets", "ouster_ros/msg/PacketMsg", 1000, "", "")
+    (line,) = unread_scans([planar, packets])
+    assert "/ouster/lidar_packets" in line
+    assert unread_scans([replace(planar, type="sensor_msgs/msg/PointCloud2"), packets]) == []

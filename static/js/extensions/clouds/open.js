@@ -16,7 +16,7 @@ const drives = () => node.querySelector("input:checked").value === "drive";
 
 export const sourceChoice = () => ({
   node,
-  takes: (uri) => !uri.startsWith("sim:") && /\.(laz|las|e57|ply|npy|npz|pcd|xyz|asc|pts|txt|csv)$/i.test(uri),
+  takes: (uri) => !uri.startsWith("sim:") && /\.(laz|las|e57|ply|npy|npz|pcd|xyz|asc|pts|ptx|txt|csv)$/i.test(uri),
   moves: drives,
   address: (uri) => (drives() ? `sim:cloud?${new URLSearchParams({ file: uri })}` : uri),
   fields: () => {

@@ -36,7 +36,7 @@ function start() {
   const legend = el("li", { id: "legend-plot", class: "plot", hidden: true, text: "plot" });
   document.querySelector(".legend .robot").before(legend);
   on("annotations", () => { legend.hidden = !plots().length; });
-  byId("trees-export").title = "Trees, path, terrain and plots for GIS, CAD and spreadsheets, and the cloud; in the coordinates that the tab Plots shows";
+  byId("trees-export").title = "The map as a file for GIS, CAD and spreadsheets, in the coordinates that the tab Plots shows";
   startPlotsPanel();
   startDetour();
 }

@@ -127,3 +127,11 @@ def test_a_cloud_is_refused_if_its_extension_is_switched_off(command, cloud, tmp
     with pytest.raises(SourceError, match="a whole cloud needs an extension"):
         asyncio.run(check_source(SourceRequest(str(cloud))))
     assert open_any_or_one_step(f"sim:cloud?file={cloud}", SourceOptions()).description.has_odometry
+
+
+def test_a_drive_through_a_cloud_is_simulated_as_a_recording(tmp_path, capsys):
+    run = tmp_path / "run.mcap"
+    stemmap(capsys, "simulate", "cloud", "--out", run).refused(
+        2, "the cloud to be driven through is not named"
+    )
+    stemmap(capsys, "simulate", "cloud?file=none.laz", "--out", run).refused(1, "there is no such file")

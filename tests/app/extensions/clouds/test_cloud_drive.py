@@ -10,7 +10,8 @@ import pytest
 
 from app.common.settings import Settings
 from app.extensions.clouds import cloud_drive
-from app.extensions.clouds.cloud_drive import first_surfels, lay_surfels, open_drive, parse_drive
+from app.extensions.clouds.cloud_drive import first_surfels, lay_surfels, open_drive
+from app.extensions.clouds.drive_address import parse_drive
 from app.web.routes.access import permitted_uri
 from pipeline.errors import SourceError
 from pipeline.io.readers import SourceOptions

@@ -73,7 +73,8 @@ def test_what_is_there_is_not_overwritten(mapped, tmp_path, capsys):
     stemmap(capsys, "export", mapped, "--out", tmp_path / "new", "--reach", "0").refused(2, "not a distance")
     stemmap(capsys, "export", mapped, "--out", "/proc/nowhere/new").refused(1, "cannot write")
     stemmap(capsys, "export", mapped, "--to", "tree-manager").refused(2, "--out")
-    stemmap(capsys, "export", mapped, "--to", "a.gpkg", "--out", tmp_path / "new").refused(2, "--out is only")
+    for name in ("a.gpkg", "a.laz"):
+        stemmap(capsys, "export", mapped, "--to", name, "--out", tmp_path / "new").refused(2, "--out is only")
 
 
 def test_a_write_that_fails_leaves_nothing(mapped, tmp_path, monkeypatch):
