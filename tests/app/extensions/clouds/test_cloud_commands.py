@@ -134,4 +134,4 @@ def test_a_drive_through_a_cloud_is_simulated_as_a_recording(tmp_path, capsys):
     stemmap(capsys, "simulate", "cloud", "--out", run).refused(
         2, "the cloud to be driven through is not named"
     )
-    stemmap(capsys, "simulate", "cloud?file=none.laz", "--out", run).refused(1, "there is no such file")
+    stemmap(capsys, "simulate", "cloud?file=none.laz", "--out", run).refused(1, "cannot open: No such file")
