@@ -29,7 +29,7 @@ REACH = 0.45  # m; maximum distance between a track and its column
 OWN = 0.15
 # m; the surroundings that decide the class of a column contain the returns at the axis, 0.3 m around it, of
 # any stem nearer than this.
-SAME_CROWN = RING_FAR + 0.3
+SHARED_SURROUNDINGS = RING_FAR + 0.3
 NEIGHBOUR = 0.7  # m; a tree without a column of its own takes the class of a column this near
 DUE_NS = 5_000_000_000  # ns after the first observation, when a trunk within DUE_REACH has a column
 DUE_REACH = 10.0  # m
@@ -73,9 +73,9 @@ def classify(
     cells, scale = cells_for(columns), per_metre(NEIGHBOUR)
     fill(cells, axis, columns, scale)
     confirm_round(tracks, cells, scale, axis, votes, verdict, tree_share)
-    trees = _best_first(axis, votes, verdict)
+    trees, was_tree = _best_first(axis, votes, verdict), tracks.verdict == TREE
     _take_classes(tracks, scan, cells, scale, axis, verdict, min(DUE_REACH, DUE_SHARE * range_max))
-    return _assign_trees(tracks, axis, trees, hits_to_confirm)
+    return _assign_trees(tracks, was_tree, axis, trees, hits_to_confirm)
 
 
 @compiled_borrowing
@@ -255,17 +255,19 @@ def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
 
 
 @compiled
-def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
+def _assign_trees(tracks: Rows, was_tree: Bool, axis: Float, trees: Int, fewest: int) -> Int:
     """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
     to the axis.
 
     Each column in their order takes the track within REACH with the highest likelihood (see `_likeliest`)
     that is not assigned yet. The class of a column depends on its surroundings: a column without a track or
-    with one without detections is a branch, a stake or undergrowth of a detected stem within SAME_CROWN
-    (`_detected_stem_near`), which becomes a tree, or of such a column within SAME_CROWN with more votes.
+    with one without detections is a branch, a stake or undergrowth of a detected stem nearby
+    (`_detected_stem_near`), which becomes a tree, or of such a column within SHARED_SURROUNDINGS whose track
+    was a tree already, else of one with more votes.
 
     Args:
         tracks: The tracks, changed in place.
+        was_tree: Whether each track was a tree before, shape (T,).
         axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
         trees: Rows of the tree columns, those with most votes first.
         fewest: Minimum number of detections of a detected track.
@@ -275,7 +277,7 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """
     count = tracks.verdict.shape[0]
     taken, new, n = np.zeros(count, np.bool_), np.empty(trees.shape[0], np.int64), 0
-    cells, scale = cells_for(count), per_metre(SAME_CROWN)
+    cells, scale = cells_for(count), per_metre(SHARED_SURROUNDINGS)
     fill(cells, tracks.x, count, scale)
     at = np.empty(trees.shape[0], np.int64)
     for k in range(trees.shape[0]):
@@ -285,34 +287,35 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
             if tracks.hits[t] > 0:
                 tracks.verdict[t] = TREE
     undetected = cells_for(axis.shape[0])
-    for k in range(trees.shape[0]):
-        t, c = at[k], trees[k]
-        x, y = axis[c, 0], axis[c, 1]
-        if t >= 0 and tracks.hits[t] > 0:
-            continue
-        stem = _detected_stem_near(tracks, cells, scale, x, y, fewest)
-        if stem >= 0:
-            tracks.verdict[stem] = TREE
-        elif nearest_in(undetected, axis, x, y, SAME_CROWN, scale) < 0:
-            put_in(undetected, axis, c, scale)
-            if t < 0:
-                new[n] = c
-                n += 1
+    for known in (True, False):
+        for k in range(trees.shape[0]):
+            t, c = at[k], trees[k]
+            x, y = axis[c, 0], axis[c, 1]
+            if (t >= 0 and tracks.hits[t] > 0) or (t >= 0 and was_tree[t]) != known:
                 continue
-            tracks.verdict[t] = TREE
-            tracks.x[t, 0], tracks.x[t, 1] = x, y
+            stem = _detected_stem_near(tracks, cells, scale, x, y, fewest)
+            if stem >= 0:
+                tracks.verdict[stem] = TREE
+            elif nearest_in(undetected, axis, x, y, SHARED_SURROUNDINGS, scale) < 0:
+                put_in(undetected, axis, c, scale)
+                if t < 0:
+                    new[n] = c
+                    n += 1
+                    continue
+                tracks.verdict[t] = TREE
+                tracks.x[t, 0], tracks.x[t, 1] = x, y
     found: Int = new[:n].copy()
     return found
 
 
 @compiled_borrowing
 def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
-    """Return the row of the track with most detections within SAME_CROWN of an axis that is a tree or has no
-    class, the lowest row of equal ones; -1 for none.
+    """Return the row of the track with most detections near an axis, the lowest row of equal ones; -1 for
+    none. It is a tree within SHARED_SURROUNDINGS, or has no class and is in the surroundings (RING_FAR).
 
     Args:
         tracks: The tracks.
-        cells, scale: Grid of the tracks for searches within SAME_CROWN, and its cells per metre.
+        cells, scale: Grid of the tracks for searches within SHARED_SURROUNDINGS, and its cells per metre.
         x, y: Position of the axis [m].
         fewest: Minimum number of detections.
     """
@@ -322,8 +325,9 @@ def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: f
         t = np.int64(cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))])
         while t >= 0:
             dx, dy = x - tracks.x[t, 0], y - tracks.x[t, 1]
+            reach = RING_FAR if tracks.verdict[t] < 0 else SHARED_SURROUNDINGS
             if (
-                dx * dx + dy * dy < SAME_CROWN * SAME_CROWN
+                dx * dx + dy * dy < reach * reach
                 and tracks.hits[t] >= fewest
                 and (tracks.verdict[t] < 0 or tracks.verdict[t] == TREE)
                 and (

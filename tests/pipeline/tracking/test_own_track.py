@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
-from pipeline.tracking.track_classification import REACH, SAME_CROWN, _best_first
+from pipeline.tracking.track_classification import REACH, SHARED_SURROUNDINGS, _best_first
 from pipeline.tracking.track_table import TrackTable
 from pipeline.tracking.tracker import COLUMN_SIGMA
-from pipeline.types.records import Columns, Verdict
+from pipeline.types.records import RING_FAR, Columns, Verdict
 from tests.pipeline.strategies import detections, track
 from tests.pipeline.tracking.test_round_fit_override import PLACE, column
 
@@ -52,7 +52,7 @@ def test_a_single_track_within_reach_gets_the_column():
     assert told((REACH + 0.01, 1))[1:] == [Verdict.TREE], "the column begins a track of its own"
 
 
-@pytest.mark.parametrize("away", [REACH + 0.01, SAME_CROWN - 0.01])
+@pytest.mark.parametrize("away", [REACH + 0.01, RING_FAR - 0.01])
 @pytest.mark.parametrize("own", [[], [(0.0, 0)]], ids=["no track", "a track without detections"])
 def test_a_column_without_detections_belongs_to_the_detected_stem_in_its_surroundings(away, own):
     assert told((away, ENOUGH), *own) == [Verdict.TREE, *[Verdict.OTHER] * len(own)]
@@ -62,7 +62,7 @@ def test_the_stem_in_the_surroundings_is_the_one_with_most_detections():
     assert told((0.5, ENOUGH), (0.8, 50)) == [None, Verdict.TREE]
 
 
-@pytest.mark.parametrize("stem", [(SAME_CROWN + 0.01, 50), (0.6, ENOUGH - 1)], ids=["too far", "too few"])
+@pytest.mark.parametrize("stem", [(RING_FAR + 0.01, 50), (0.6, ENOUGH - 1)], ids=["too far", "too few"])
 def test_a_column_without_a_detected_stem_in_its_surroundings_begins_a_track(stem):
     assert told(stem)[1:] == [Verdict.TREE]
 
@@ -95,13 +95,13 @@ def test_what_has_a_column_that_is_no_tree_is_not_the_stem_of_a_column_beside_it
 @pytest.mark.parametrize(
     ("hits", "away", "trees"),
     [
-        ((20, 0), SAME_CROWN - 0.01, [True, False]),
-        ((20, 1), SAME_CROWN - 0.01, [True, True]),
-        ((20, 0), SAME_CROWN + 0.01, [True, True]),
+        ((20, 0), SHARED_SURROUNDINGS - 0.01, [True, False]),
+        ((20, 1), SHARED_SURROUNDINGS - 0.01, [True, True]),
+        ((20, 0), SHARED_SURROUNDINGS + 0.01, [True, True]),
         ((20, ENOUGH), 0.6, [True, True]),
-        ((0, ENOUGH), SAME_CROWN - 0.01, [False, True]),
-        ((0, 0), SAME_CROWN - 0.01, [True, False]),
-        ((0, 0), SAME_CROWN + 0.01, [True, True]),
+        ((0, ENOUGH), SHARED_SURROUNDINGS - 0.01, [False, True]),
+        ((0, 0), SHARED_SURROUNDINGS - 0.01, [True, False]),
+        ((0, 0), SHARED_SURROUNDINGS + 0.01, [True, True]),
     ],
 )
 def test_a_second_tree_in_the_surroundings_of_a_tree_has_detections(hits, away, trees):
@@ -114,6 +114,19 @@ def test_a_second_tree_in_the_surroundings_of_a_tree_has_detections(hits, away, 
     other.axis[0, :2] = table.x[1, :2]
     tracker.classify(1, together(one, other), FOREST.classification)
     assert [verdict == Verdict.TREE for verdict in tracker.tracks.verdict.tolist()] == trees
+
+
+def test_of_two_trees_without_detections_the_one_that_was_a_tree_remains():
+    tracker = Tracker(FOREST.tracking)
+    table = TrackTable.empty(2)
+    table.x[:, :2] = PLACE + np.array([[0.0, 0.0], [1.0, 0.0]])
+    table.number[:] = 1, 2
+    tracker.tracks, tracker.next_number = table, 3
+    for share in (0.8, 0.95, 0.8):  # of the votes for the second one; the first has 0.9
+        one, other = column(Verdict.TREE, tree=0.9), column(Verdict.TREE, tree=share)
+        other.axis[0, :2] = PLACE + np.array([1.0, 0.0])
+        tracker.classify(1, together(one, other), FOREST.classification)
+        assert tracker.tracks.verdict.tolist() == [Verdict.TREE, Verdict.OTHER]
 
 
 def together(one: Columns, other: Columns) -> Columns:
