@@ -21,6 +21,10 @@ TEXT_LIMIT = 64 << 20
 #: Rotation from the axes of a camera (x right, y down, z forward) to those of a LiDAR.
 R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _STILL = 0.05
+#: Tolerance of the length of a quaternion: numbers with two decimals are off by up to 0.01.
+_UNIT_LENGTH = 0.01
+#: A number of a frame, as KITTI-360 writes it before a matrix; seconds since 1970 have more digits.
+_FRAME = re.compile(r"[0-9]{1,9}", re.ASCII)
 TUM_COLUMNS, KITTI_COLUMNS = 8, 12
 POSE_ROWS = "t x y z qx qy qz qw (TUM) or the 12 numbers of a 3 x 4 matrix (KITTI), also after a time"
 
@@ -34,24 +38,30 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
     time and a 3 x 4 matrix with times [ns], int64, shape (N,), or KITTI rows of a matrix (times None).
 
     Blanks, commas or semicolons separate the numbers. The names in a first line, such as
-    `#sec,nsec,x,y,z,qx,qy,qz,qw`, tell the order of the columns. KITTI writes the poses of its left camera (x
+    `#sec,nsec,x,y,z,qx,qy,qz,qw`, tell the columns of a time and a TUM pose; names that do not tell them are
+    refused. Without names, the number of columns tells them. KITTI writes the poses of its left camera (x
     right, y down, z forward); others write those of the LiDAR. If a file `calib.txt` with a valid row `Tr:`
     is in the same folder, they are KITTI poses. Otherwise the motion decides: a robot moves along z of a
     camera or along x of a LiDAR.
 
     Raises:
-        TextError: The file has neither format, times that do not strictly ascend or cannot be read, a
-            quaternion of length 0, or positions of COORDINATE_LIMIT or more.
+        TextError: The file has neither format, names that do not tell the columns, times that do not strictly
+            ascend or cannot be read, a quaternion whose length is not 1 within _UNIT_LENGTH, or positions of
+            COORDINATE_LIMIT or more.
         OSError: The file cannot be read.
     """
     names, lines = _named_lines(path)
     columns = len(lines[0]) if lines else 0
-    found = _named_columns(names, columns) or _COLUMNS.get(columns)
+    found = _named_columns(names) if names else _COLUMNS.get(columns)
     if found is None:
         raise TextError(f"its rows have {columns} columns; readable are {POSE_ROWS}")
+    if names:
+        columns = len(names)
     if any(len(line) != columns for line in lines):
         raise TextError(f"its rows do not have {columns} numbers")
     time, pose = found
+    if time and len(pose) == KITTI_COLUMNS and all(_FRAME.fullmatch(line[0]) for line in lines):
+        raise TextError("its rows begin with numbers of frames in place of times")
     rows = _table([[line[k] for k in pose] for line in lines], len(pose))
     times = _times([[line[k] for k in time] for line in lines]) if time else None
     if times is not None and np.any(np.diff(times) <= 0):
@@ -60,10 +70,9 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
         T_camera_lidar = None if time else _calibration(path.with_name("calib.txt"))
         return times, _poses_of_matrices(rows.reshape(-1, 3, 4), T_camera_lidar)
     _check_positions(rows[:, :3])
-    try:
-        return times, [Pose3.from_quaternion(row[:3], row[[6, 3, 4, 5]]) for row in rows]
-    except ValueError as error:
-        raise TextError("it has a quaternion of no length") from error
+    if np.any(np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) > _UNIT_LENGTH):
+        raise TextError("it has quaternions whose length is not 1")
+    return times, [Pose3.from_quaternion(row[:3], row[[6, 3, 4, 5]]) for row in rows]
 
 
 def _poses_of_matrices(rows: Float, T_camera_lidar: Pose3 | None) -> list[Pose3]:
@@ -110,34 +119,42 @@ _COLUMNS: dict[int, tuple[list[int], list[int]]] = {
 _AXES = tuple(re.compile(rf"(?:[pt]|p.*_|pos.*[._])?{axis}(?:_?m)?") for axis in "xyz") + tuple(
     re.compile(rf"(?:q|q.*_|.*rot.*[._]|.*orient.*[._]){axis}") for axis in "xyzw"
 )
-_SECONDS, _NANOSECONDS = re.compile(r"secs?|seconds"), re.compile(r"n_?secs?|nanosec.*|ns")
+_TIME = re.compile(r"(?:.*[._])?(?:t|[a-z]*time|[a-z]*stamp)s?(?:_(?:s|ns|us|ms))?")
+_SECONDS, _NANOSECONDS = (
+    re.compile(rf"(?:.*[._])?(?:{unit})") for unit in ("secs?|seconds", "n_?secs?|nanosec.*|ns")
+)
 _UNIT = re.compile(r"\[.*?\]|\(.*?\)|[%#\s\"']")
 
 
-def _named_columns(names: list[str], columns: int) -> tuple[list[int], list[int]] | None:
-    """Return the columns of time and pose, as in _COLUMNS, by their names; None if they do not tell them."""
-    if len(names) != columns:
-        return None
+def _named_columns(names: list[str]) -> tuple[list[int], list[int]]:
+    """Return the columns of time and pose, as in _COLUMNS, by their names; TextError if these do not tell
+    exactly one column of each. Seven columns have no time."""
     pose = [[k for k, name in enumerate(names) if axis.fullmatch(name)] for axis in _AXES]
-    if any(len(found) != 1 for found in pose):
-        return None
-    first = min(found[0] for found in pose)
-    is_split = first > 1 and _SECONDS.fullmatch(names[first - 2]) and _NANOSECONDS.fullmatch(names[first - 1])
-    time = [first - 2, first - 1] if is_split else [first - 1][:first]
-    return time, [found[0] for found in pose]
+    parts = [[k for k, name in enumerate(names) if part.fullmatch(name)] for part in (_SECONDS, _NANOSECONDS)]
+    times = [k for k, name in enumerate(names) if _TIME.fullmatch(name)]
+    if len(names) == TUM_COLUMNS - 1:
+        parts = []
+    elif [len(part) for part in parts] != [1, 1]:
+        parts = [sorted({*times, *parts[0], *parts[1]})]
+    if any(len(found) != 1 for found in [*pose, *parts]):
+        raise TextError(f"the names of its columns do not tell time and pose: {' '.join(names)[:100]}")
+    return [found[0] for found in parts], [found[0] for found in pose]
 
 
 def _named_lines(path: Path) -> tuple[list[str], list[list[str]]]:
     """Return the names of the columns in the first line, in lower case without units and signs of a comment,
-    [] if it has none, and the words of the rows; errors as `_lines`."""
+    and the words of the rows; errors as `_lines`. The names are [] if the line has numbers, or is a comment
+    with another number of words than a row."""
     text = _text(path)
-    first = text.lstrip("\ufeff").split("\n", 1)[0].strip()
-    split = re.split(r"[,;]", first) if re.search(r"[,;]", first) else first.lstrip("%# ").split()
+    first, _, rest = text.partition("\n")
+    line = first.strip().rstrip(",; ")
+    split = re.split(r"[,;]", line) if re.search(r"[,;]", line) else line.lstrip("%# ").split()
     names = [_UNIT.sub("", word).lower() for word in split]
     if not any(re.search(r"[a-df-z]", name) and not name.startswith(("nan", "inf")) for name in names):
         return [], _words(text)
-    rows = _words(text.lstrip("\ufeff").partition("\n")[2])
-    return (names, rows) if rows else ([], _words(text))
+    rows = _words(rest)
+    is_comment = first.startswith(("#", "%")) and rows and len(names) != len(rows[0])
+    return (names, rows) if rows and not is_comment else ([], _words(text))
 
 
 def _times(stamps: Iterable[list[str]]) -> Int:
@@ -154,7 +171,7 @@ def _times(stamps: Iterable[list[str]]) -> Int:
             time_ns(words[0]) if len(words) == 1 else int(words[0]) * 1_000_000_000 + int(words[1])
             for words in stamps
         ]
-        return np.array(found, dtype=np.int64)
+        return np.array([_in_bounds(time) for time in found], dtype=np.int64)
     except (ValueError, OverflowError) as error:
         raise TextError("its times are no seconds") from error
 
@@ -165,9 +182,10 @@ _DIGITS = {13: 1_000_000, 16: 1000, 19: 1}
 
 def time_ns(text: str) -> int:
     """Return a time as integer nanoseconds: decimal seconds (see `seconds_ns`, also for errors), or milli-,
-    micro- or nanoseconds since 1970 without decimals."""
-    factor = _DIGITS.get(len(text)) if text.isascii() and text.isdigit() else None
-    return seconds_ns(text) if factor is None else int(text) * factor
+    micro- or nanoseconds since 1970, whose decimals are zeros."""
+    whole = re.sub(r"\.0*$", "", text)
+    factor = _DIGITS.get(len(whole)) if whole.isascii() and whole.isdigit() else None
+    return seconds_ns(text) if factor is None else _in_bounds(int(whole) * factor)
 
 
 def seconds_ns(text: str) -> int:
@@ -185,9 +203,14 @@ def seconds_ns(text: str) -> int:
         if plain and len(whole) < 12
         else round(float(text) * 1e9)
     )
-    if abs(nanoseconds) >= 1 << 62:
+    return _in_bounds(nanoseconds)
+
+
+def _in_bounds(time_ns: int) -> int:
+    """Return a time [ns]; ValueError if its magnitude is not less than 2^62."""
+    if abs(time_ns) >= 1 << 62:
         raise ValueError("too far away in time")
-    return nanoseconds
+    return time_ns
 
 
 def read_times(path: Path) -> Int:
@@ -221,7 +244,7 @@ def _check_positions(positions: Float) -> None:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a file.
+    """Return the text of a file, without a byte order mark.
 
     Raises:
         TextError: The file is larger than TEXT_LIMIT, or is not UTF-8.
@@ -230,7 +253,7 @@ def _text(path: Path) -> str:
     if path.stat().st_size > TEXT_LIMIT:
         raise TextError(f"it is longer than {TEXT_LIMIT >> 20} MB")
     try:
-        return path.read_text("utf-8")
+        return path.read_text("utf-8-sig")
     except UnicodeDecodeError as error:
         raise TextError("it is no text") from error
 
