@@ -41,9 +41,9 @@ CONTRADICTION = (
     "motions of scans that contradict the odometry: it is of another robot, or its wheels slip, and "
     "the map may be wrong; --odometry lidar uses the scans alone"
 )
-ON_ITS_SIDE = (
-    "motions of scans of a LiDAR that lies on its side by the ground: they do not show its yaw well; give "
-    "its pose with --mount"
+UNKNOWN_YAW = (
+    "motions of scans of a LiDAR that is tilted by more than 45 degrees by the ground: they do not show its "
+    "yaw; give its pose with --mount"
 )
 #: Number of IMU messages in which an orientation is looked for.
 _TRIES = 20
@@ -164,8 +164,9 @@ class RosSource(MessageSource):
         if median_range(found.scan) > FARTHEST_MEDIAN:
             count_loss(self._damage, NO_METRES, scans.count)
         mounting = find_mounting(found, odometry, extrinsics, messages, decoder, options, live=live)
-        if mounting.is_assumed and mounting.T_base_lidar and abs(mounting.T_base_lidar.R[2, 2]) < _UPRIGHT:
-            count_loss(self._damage, ON_ITS_SIDE, scans.count)
+        tilted = mounting.T_base_lidar if mounting.is_assumed and not mounting.shows_yaw else None
+        if tilted is not None and abs(tilted.R[2, 2]) < _UPRIGHT:
+            count_loss(self._damage, UNKNOWN_YAW, scans.count)
         elif mounting.contradicting:
             count_loss(self._damage, CONTRADICTION, mounting.contradicting)
         if mounting.odometry is not odometry:

@@ -46,6 +46,8 @@ class Mounting:
         T_base_lidar: Extrinsics of the LiDAR; None if they are unknown: it is taken to be at the base.
         is_measured: Whether they were found by the ground or the motion.
         is_assumed: Whether the robot has odometry, and neither a fixed transform nor the user tells them.
+        is_stated: Whether the user tells them.
+        shows_yaw: Whether the motion of the scans beside the odometry shows the yaw.
         contradicting: Number of scans whose motion contradicts that of the odometry.
         warnings: Messages for the user about what is assumed.
     """
@@ -56,6 +58,8 @@ class Mounting:
     T_base_lidar: Pose3 | None = None
     is_measured: bool = False
     is_assumed: bool = False
+    is_stated: bool = False
+    shows_yaw: bool = False
     contradicting: int = 0
     warnings: tuple[str, ...] = ()
 
@@ -110,6 +114,7 @@ def find_mounting(
         T_base_lidar=motion.T_base_lidar,
         is_measured=motion.T_base_lidar is not None,
         is_assumed=is_assumed,
+        shows_yaw=motion.shows_yaw,
         contradicting=motion.contradicting,
         warnings=tuple(warnings),
     )
@@ -137,7 +142,10 @@ def _mounting_by_frames(
     else:
         # A frame without a name has no place on the robot, not even that of a base without a name.
         linked = tree.find(base, frame) if frame else None
-    return Mounting(base, frame, odometry, options.T_base_lidar or linked, warnings=tuple(warnings))
+    stated = options.T_base_lidar
+    return Mounting(
+        base, frame, odometry, stated or linked, is_stated=stated is not None, warnings=tuple(warnings)
+    )
 
 
 def _usual_lidar(tree: TransformTree, base: str) -> str:
@@ -153,11 +161,12 @@ def _usual_lidar(tree: TransformTree, base: str) -> str:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
     """T_base_lidar by ground and motion (None if unknown, or the LiDAR is upright and looks ahead), number of
-    scans that contradict the odometry, and messages for the user."""
+    scans that contradict the odometry, messages for the user, and whether the motion shows the yaw."""
 
     T_base_lidar: Pose3 | None
     contradicting: int = 0
     warnings: tuple[str, ...] = ()
+    shows_yaw: bool = False
 
 
 def _mounting_by_motion(
@@ -190,14 +199,16 @@ def _mounting_by_motion(
         return _Motion(level, 0, warnings)
     yaw = better_yaw(found.yaw, at, points)
     degrees = round(float(np.degrees(yaw))) % 360
-    if found.contradicts or not degrees:
-        return _Motion(level, len(scans) if found.contradicts else 0, warnings)
+    if found.contradicts:
+        return _Motion(level, len(scans), warnings)
+    if not degrees:
+        return _Motion(level, 0, warnings, shows_yaw=True)
     text = (
         f"by the motion of the scans beside the odometry over {found.length:.0f} m, the yaw of the mounting "
         f"is {degrees} degrees; --mount overrides this"
     )
     T_base_lidar = Pose3.from_euler(np.zeros(3), 0.0, 0.0, yaw) @ (level or Pose3.identity())
-    return _Motion(T_base_lidar, 0, (*warnings, text))
+    return _Motion(T_base_lidar, 0, (*warnings, text), shows_yaw=True)
 
 
 def _poses_at(scans: list[Scan], times_ns: Int, path: Float) -> Float:
@@ -247,10 +258,13 @@ def contradiction_of_yaw(mounting: Mounting, messages: TimedMessages, decoder: R
         return ""
     degrees = [round(float(np.degrees(yaw))) for yaw in (found.yaw, stated)]
     frames = f"{mounting.base or 'the base'} to {mounting.lidar or 'the LiDAR'}"
+    wrong = f"the transform from {frames} has a wrong yaw, or is inverted"
+    remedy = "give the pose of the LiDAR with --mount"
+    if mounting.is_stated:
+        wrong, remedy = "the yaw given with --mount is wrong", "correct it"
     return (
-        f"the transform from {frames} has a wrong yaw, or is inverted: by the motion of the scans beside the "
-        f"odometry over {found.length:.0f} m it is {degrees[0]} degrees, and not {degrees[1]}; give the pose "
-        "of the LiDAR with --mount"
+        f"{wrong}: by the motion of the scans beside the odometry over {found.length:.0f} m it is "
+        f"{degrees[0]} degrees, and not {degrees[1]}; {remedy}"
     )
 
 

@@ -106,7 +106,7 @@ def check_tilt(
     tilt = _common_tilt(grounds)
     if not (blamed or has_imu) or not tilt or _mean_of(grounds) @ _mean_of(trunks) < np.cos(_ALIKE):
         return TiltCheck()
-    wrong = f"the orientation in {imu} or the fixed transforms are wrong" if imu else blamed
+    wrong = ", or ".join(filter(None, (f"the orientation in {imu} is wrong" if imu else "", blamed)))
     return TiltCheck(
         messages.odometry.topics.chosen["scan"].count,
         f"tilts of scans whose ground and trunks are tilted by {np.degrees(tilt):.0f} degrees in the same "

@@ -10,10 +10,11 @@ import pytest
 
 from app.batch.summary import left_out_warning
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.ros import CONTRADICTION, ON_ITS_SIDE
+from pipeline.io.readers import SourceOptions
+from pipeline.io.readers.ros import CONTRADICTION, UNKNOWN_YAW
 from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.lidar import SpinningLidar
-from pipeline.types.records import Imu
+from pipeline.types.records import Imu, Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, Author, Write, write_recording
 
@@ -98,9 +99,17 @@ def test_trunks_that_lean_by_transform_and_imu_are_a_contradiction(tmp_path: Pat
     # The base is tilted against the ground as well, so that neither can be trusted.
     source = opened(recorded(tmp_path, "sim:stand?duration=10", tilted(10, 0), tilted(0, 15)))
     list(source.records())
-    assert any(
-        "the orientation in /imu or the fixed transforms are wrong" in reason for reason in source.losses
-    )
+    (reason,) = [reason for reason in source.losses if "ground and trunks" in reason]
+    assert "the orientation in /imu is wrong, or the fixed transform is wrong;" in reason
+
+
+def test_without_a_transform_a_wrong_orientation_blames_none_that_is_there(tmp_path: Path, opened: Opened):
+    mounting, orientation = tilted(10, 0), tilted(0, 15)
+    path = recorded(tmp_path, "sim:stand?duration=10", mounting, orientation, child="lidar_link")
+    source = opened(path)
+    list(source.records())
+    (reason,) = [reason for reason in source.losses if "ground and trunks" in reason]
+    assert "the orientation in /imu is wrong, or no fixed transform from velodyne to base_link" in reason
 
 
 def test_an_upright_lidar_is_read_rather_than_one_that_turns_about_a_horizontal_axis(
@@ -130,5 +139,35 @@ def test_a_lidar_on_its_side_is_named_rather_than_the_odometry(tmp_path: Path, o
     source = opened(recorded(tmp_path, "sim:stand?duration=10", tilted(90, 0), child="lidar_link"))
     list(source.records())
     assert source.description.T_base_lidar.R[2, 2] < 0.1
-    assert ON_ITS_SIDE in source.losses
+    assert UNKNOWN_YAW in source.losses
     assert CONTRADICTION not in source.losses
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "lidar"), [(60, 0, "os0-128"), (0, 50, "mid360"), (90, 0, "vlp16")]
+)
+def test_a_lidar_on_its_side_whose_motion_shows_the_yaw_is_no_loss(
+    roll: float, pitch: float, lidar: str, tmp_path: Path, opened: Opened
+):
+    mounting = Pose3.from_euler(np.array([0.0, 0.0, 0.8]), np.radians(roll), np.radians(pitch), np.pi / 2)
+    address = f"sim:stand?duration=8&odometry=exact&lidar={lidar}"
+
+    def fill(author: Author, write: Write) -> None:
+        for record in open_simulated(address, SourceOptions(T_base_lidar=mounting)).records():
+            stamp_ns = record.stamp_ns
+            if isinstance(record, Odometry):
+                x, y, yaw = record.T_odom_base.planar().as_array()
+                message = author.odometry(stamp_ns, float(x), float(yaw))
+                message.pose.pose.position.y = float(y)
+                write("/odom", "nav_msgs/msg/Odometry", stamp_ns, message)
+            elif isinstance(record, Scan):
+                table = np.zeros(len(record.points), [(axis, "<f4") for axis in "xyz"])
+                for axis, column in zip("xyz", record.points.T, strict=True):
+                    table[axis] = column
+                write("/points", "sensor_msgs/msg/PointCloud2", stamp_ns, author.cloud(stamp_ns, table))
+
+    source = opened(write_recording("mcap", tmp_path, fill))
+    turn = source.description.T_base_lidar.R @ mounting.R.T
+    assert np.arccos((np.trace(turn) - 1.0) / 2.0) < np.radians(5.0)
+    assert any("by the ground" in text for text in source.description.warnings)
+    assert source.losses == {}

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.poses import Float, Pose3
-from pipeline.io.readers import Source
+from pipeline.io.readers import Source, SourceOptions
 from pipeline.io.readers.ros import RosSource
 from pipeline.odometry.mounting_yaw import yaw_of_mounting
 from pipeline.types.records import Odometry, Scan
@@ -276,6 +276,15 @@ def test_a_fixed_transform_with_another_yaw_than_the_motion_is_told(
     if text:
         assert text.startswith("the transform from base_link to velodyne has a wrong yaw")
         assert f"and not {stated};" in text
+
+
+def test_a_mounting_of_the_user_with_another_yaw_than_the_motion_is_told(tmp_path: Path, opened: Opened):
+    options = SourceOptions(T_base_lidar=Pose3.identity())
+    source = opened(write_recording("mcap", tmp_path, unlinked(math.radians(90))), options)
+    assert isinstance(source, RosSource)
+    text = source.contradiction_of_mounting()
+    assert text.startswith("the yaw given with --mount is wrong: by the motion")
+    assert text.endswith("and not 0; correct it")
 
 
 def test_odometry_of_a_robot_that_stands_contradicts_scans_that_move(tmp_path: Path, opened: Opened):
