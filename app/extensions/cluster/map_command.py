@@ -98,13 +98,13 @@ def _runs_in(source: str) -> list[str]:
     """Return the names of the runs in a folder, without those of a slash at their end; [] if the source is a
     run itself, is no folder, or has one run, which is mapped as the source."""
     import app.sources  # noqa: F401 - adds the formats of the extensions
-    from pipeline.io.readers import folder_opener, folders_of_runs, path_of, recordings_in
+    from pipeline.io.readers import folder_opener, path_of, runs_in
 
     try:
         folder = Path(path_of(source)).expanduser()
         if not folder.is_dir() or folder_opener(folder) is not None:
             return []
-        names = [*recordings_in(folder), *(name.rstrip("/") for name in folders_of_runs(folder))]
+        names = [name.rstrip("/") for name in runs_in(folder)]
     except (OSError, RuntimeError, ValueError):
         return []
     return sorted(names) if len(names) > 1 else []

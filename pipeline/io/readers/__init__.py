@@ -30,7 +30,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
 
     Args:
         uri: A simulated scenario ("sim:stand"), a file or a folder. The format is detected by the contents
-            first, then by the name. A folder that is no run and has one recording or run in it is that.
+            first, then by the name. A folder that is no run is the only recording or run in it (`runs_in`).
         options: Choices of the user; None for the defaults.
 
     Raises:
@@ -45,7 +45,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
             return _open_scheme(scheme.group(1).lower(), uri, chosen)
         path = Path(uri).expanduser()
         if path.is_dir() and folder_opener(path) is None:
-            names = recordings_in(path) + folders_of_runs(path)
+            names = runs_in(path)
             if len(names) == 1:
                 return open_source(str(path / names[0]), chosen)
         return _find_opener(path, uri, chosen)(uri, path, chosen)
@@ -122,7 +122,7 @@ def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
     if path.is_dir():
         opener = folder_opener(path)
         if opener is None:
-            inside = named(recordings_in(path) + folders_of_runs(path))
+            inside = named(runs_in(path))
             raise SourceError(
                 "the folder is no run" if inside else "nothing in the folder can be read",
                 where=uri,
@@ -386,20 +386,36 @@ def recordings_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.is_file() and is_recording(path))
 
 
-def folders_of_runs(folder: Path, *, levels: int = 2) -> list[str]:
+def runs_in(folder: Path) -> list[str]:
+    """Return the names of the runs in a folder that is none itself: its only recording, whatever folders are
+    beside it, else its recordings and its folders with runs. OSError if it cannot be read."""
+    names = recordings_in(folder)
+    return names if len(names) == 1 else names + folders_of_runs(folder)
+
+
+def folders_of_runs(folder: Path) -> list[str]:
     """Return the sorted names, with a slash, of the folders in a folder that are runs or contain recordings
-    or runs, up to some levels; without those that cannot be read. OSError if the folder itself cannot be
-    read."""
-    found = []
-    for path in sorted(folder.iterdir()):
-        with suppress(OSError):
-            if path.is_dir() and (
-                folder_opener(path)
-                or recordings_in(path)
-                or (levels > 1 and folders_of_runs(path, levels=levels - 1))
-            ):
-                found.append(f"{path.name}/")
-    return found
+    or runs, also one level below. Left out are folders of results (with run.json), and those that cannot be
+    read; no file is opened, so that texts do not count. OSError if the folder itself cannot be read."""
+    return sorted(f"{path.name}/" for path in folder.iterdir() if _has_runs(path, levels=2))
+
+
+def _has_runs(folder: Path, levels: int) -> bool:
+    """Return whether a path is a folder that is a run or contains recordings or runs, up to some levels."""
+    with suppress(OSError):
+        if levels and folder.is_dir() and not (folder / "run.json").is_file():
+            return (
+                folder_opener(folder) is not None
+                or any(_is_recording_by_name(path) and path.is_file() for path in folder.iterdir())
+                or any(_has_runs(path, levels - 1) for path in folder.iterdir())
+            )
+    return False
+
+
+def _is_recording_by_name(path: Path) -> bool:
+    """Return whether a file is a run or a cloud by its suffix alone."""
+    expected = expected_format(path)
+    return expected is not None and not expected.refusal and expected.accepts is None
 
 
 def named(names: list[str]) -> str:

@@ -163,9 +163,14 @@ _ROWS = (
     ("Boreas .bin", ("x", "y", "z", "intensity", "ring", "time")),
 )
 _NCLT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
-#: Unit and offset of the coordinates of NCLT, and height that its sensor does not see beyond [m].
-_NCLT_UNIT, _NCLT_ZERO, _NCLT_HIGHEST = 0.005, -100.0, 50.0
+#: Unit and offset of the coordinates of NCLT [m], whose y points to the right and z down.
+_NCLT_UNIT, _NCLT_ZERO = 0.005, -100.0
+#: Height from the sensor that few returns of a drive exceed [m]: the LiDARs of these data sets (HDL-64E,
+#: HDL-32E, VLS-128) look up by 15 degrees at most, which is 50 m at a distance of 190 m.
+_HIGHEST = 50.0
 _TESTED_ROWS = 48_000  # bytes, whole rows of each kind
+#: Smaller files are KITTI: less than 20 rows may fit to another layout by chance.
+_LEAST = 320  # bytes
 _FITTING = 0.99  # share of rows that are sound by the right layout; the rest is damage
 
 
@@ -180,16 +185,23 @@ def open_rows(path: Path) -> PointTable:
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(_TESTED_ROWS)
-    for kind, names in _ROWS:
-        dtype = np.dtype([(name, "<f4") for name in names])
-        if size % dtype.itemsize == 0 and _are_rows(_first_rows(head, dtype)):
-            return _binary_table(path, kind, size // dtype.itemsize, [_Stream(0, dtype, size)])
-    if size % _NCLT.itemsize == 0 and _are_rows(_metres(_first_rows(head, _NCLT))):
-        table = _binary_table(path, "NCLT .bin", size // _NCLT.itemsize, [_Stream(0, _NCLT, size)])
+    layouts = [(kind, np.dtype([(name, "<f4") for name in names])) for kind, names in _ROWS]
+    kitti, dtype = layouts[0]
+    for kind, other in layouts if size >= _LEAST else ():
+        if _are_rows(_first_rows(head, other)):
+            return _rows_table(path, kind, other, size)
+    if size >= _LEAST and _are_rows(_metres(_first_rows(head, _NCLT))):
+        table = _rows_table(path, "NCLT .bin", _NCLT, size)
         return replace(table, read=lambda begin: (_metres(part) for part in table.read(begin)))
-    kind, names = _ROWS[0]
-    dtype = np.dtype([(name, "<f4") for name in names])
-    return _binary_table(path, kind, size // dtype.itemsize, [_Stream(0, dtype, size)])
+    return _rows_table(path, kitti, dtype, size)
+
+
+def _rows_table(path: Path, kind: str, dtype: np.dtype[Any], size: int) -> PointTable:
+    """Return the table of rows without a header in a file of some bytes. An incomplete last row is a promised
+    point, which its reader counts as missing; those of KITTI are counted by `scan_folder.load_bin`."""
+    whole, rest = divmod(size, dtype.itemsize)
+    points = whole + (rest > 0 and kind != _ROWS[0][0])
+    return _binary_table(path, kind, points, [_Stream(0, dtype, size)])
 
 
 def _first_rows(head: bytes, dtype: np.dtype[Any]) -> Columns:
@@ -199,17 +211,17 @@ def _first_rows(head: bytes, dtype: np.dtype[Any]) -> Columns:
 
 
 def _metres(columns: Columns) -> Columns:
-    """Return columns of NCLT with coordinates in metres."""
-    axes = {axis: columns[axis].astype(np.float64) * _NCLT_UNIT + _NCLT_ZERO for axis in "xyz"}
-    return {**columns, **axes}
+    """Return columns of NCLT with coordinates in metres, y to the left and z up."""
+    x, y, z = (columns[axis].astype(np.float64) * _NCLT_UNIT + _NCLT_ZERO for axis in "xyz")
+    return {**columns, "x": x, "y": -y, "z": -z}
 
 
 def _are_rows(columns: Columns) -> bool:
-    """Return whether nearly all rows have coordinates of a scan and a reflectance."""
-    x, y, z, reflectance = (columns[name].astype(np.float64) for name in _ROWS[0][1])
-    with np.errstate(invalid="ignore"):
-        sound = (np.maximum(np.abs(x), np.abs(y)) < RANGE_LIMIT) & (np.abs(z) < _NCLT_HIGHEST)
-        sound &= reflectance >= 0.0
+    """Return whether nearly all rows without NaN have coordinates of a scan and a reflectance, and there are
+    such rows."""
+    rows = np.column_stack([columns[name].astype(np.float64) for name in _ROWS[0][1]])
+    x, y, z, reflectance = rows[~np.isnan(rows).any(axis=1)].T
+    sound = (np.maximum(np.abs(x), np.abs(y)) < RANGE_LIMIT) & (np.abs(z) < _HIGHEST) & (reflectance >= 0.0)
     return bool(sound.size and sound.mean() > _FITTING)
 
 

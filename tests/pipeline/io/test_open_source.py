@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SourceError
-from pipeline.io.readers import open_source
+from pipeline.io import readers
+from pipeline.io.readers import open_source, runs_in
 from tests.pipeline.io.conftest import Opened
 
 
@@ -107,3 +108,30 @@ def test_a_folder_with_one_recording_that_is_no_run_is_that_recording(tmp_path: 
     with pytest.raises(SourceError) as of_folder:
         open_source(str(tmp_path))
     assert str(of_folder.value) == str(of_file.value)
+
+
+@pytest.mark.parametrize("beside", ["LOAM/GlobalMap.pcd", "drive/more.bag"])
+def test_a_single_recording_is_opened_whatever_folders_are_beside_it(beside: str, tmp_path: Path):
+    (tmp_path / "run.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    (tmp_path / beside).parent.mkdir()
+    (tmp_path / beside).touch()
+    with pytest.raises(SourceError, match=r"run\.bag"):
+        open_source(str(tmp_path))
+
+
+def test_folders_of_results_are_no_runs(tmp_path: Path):
+    for name in ("a_run", "b_run", "results"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "000000.bin").touch()
+    (tmp_path / "results" / "run.json").touch()
+    assert runs_in(tmp_path) == ["a_run/", "b_run/"]
+
+
+def test_no_file_is_opened_to_find_runs_in_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    texts = readers.format_of_points("text", (), ".txt", accepts=lambda head: head.startswith(b"1 2 3"))
+    monkeypatch.setattr(readers, "_further", [lambda: [texts]])
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "points.txt").write_text("1 2 3\n4 5 6\n")
+    assert readers.recordings_in(tmp_path / "notes") == ["points.txt"]
+    monkeypatch.setattr(Path, "open", lambda *_: pytest.fail("a file is opened"))
+    assert readers.folders_of_runs(tmp_path) == []
