@@ -75,7 +75,7 @@ def test_an_e57_file_with_the_name_of_scans_is_read_by_its_contents(tmp_path: Pa
         open_points(file)
 
 
-def test_a_folder_of_captures_is_many_runs_in_a_process_of_its_own(tmp_path: Path):
+def test_a_folder_of_captures_is_several_runs_in_a_process_of_its_own(tmp_path: Path):
     for name in ("a.pcap", "b.pcap"):
         (tmp_path / name).touch()
     code = "import sys; from app.extensions.cluster.map_command import _runs_in; print(_runs_in(sys.argv[1]))"
