@@ -36,10 +36,10 @@ from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor
 
 #: Period of scans without times: 10 Hz.
 STEP_NS = 100_000_000
-#: Usual names of files with times and with poses; further texts with such a word in their names are poses.
+#: Usual names of files with times and with poses; further texts with such a word in their names may be poses.
 TIMES = ("times.txt", "timestamps.txt")
 POSES = ("poses.txt", "poses.tum", "trajectory.txt", "trajectory.tum", "groundtruth.txt")
-_POSE_WORDS = re.compile(r"pose|traj|odom", re.IGNORECASE)
+_POSE_WORDS = re.compile(r"(?:^|[_-])(?:poses?|traj\w*|odom\w*|groundtruth)(?:$|[_-])", re.IGNORECASE)
 _TEXTS = (".txt", ".csv", ".tum")
 _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
 #: Number of unreadable files at the start after which the folder is refused.
@@ -53,16 +53,21 @@ T = TypeVar("T")
 #: Reads one file: (path, stamp_ns, times, losses) -> scan. Raises ScanFileError or OSError.
 Loader = Callable[[Path, int, PointTimes | None, dict[str, int]], Scan]
 
+#: Pose of each scan, None for a scan without one, and new times of the scans [ns], if any.
+Fit = tuple[list[Pose3 | None], Int | None]
+
 
 class ScanFolder(FileSource):
     """Source of scans from files, in the order of the numbers in their names.
 
-    Poses (odometry; `poses.txt`, the other names of POSES and other texts with such words in their names, see
-    `read_any_poses`) and `times.txt` or `timestamps.txt` are read from the folder or its parent; poses with
-    times also from two folders above. The number in the name of a scan file is its row
+    Poses (odometry; `poses.txt` and the other names of POSES, see `read_any_poses`) and `times.txt` or
+    `timestamps.txt` are read from the folder or its parent. The number in the name of a scan file is its row
     in them, or its index in the folder when there are as many rows as files; if neither fits, a warning is
-    given and they are not used. Without a file of times, the times are those in the names of the scans
-    (1645000000.25.pcd), else those of TUM rows. TUM rows are matched to scans by time where both have times.
+    given and they are not used. Without such poses, those in the only text with a word like "odom" in its
+    name are used whose times are those of the scans, or which has as many rows as there are scans; two
+    folders above, only times tell that they belong to this run. Without a file of times, the times are those
+    in the names of the scans (1645000000.25.pcd), else those of TUM rows. TUM rows are matched to scans by
+    time where both have times.
 
     Args:
         uri: Path as the user wrote it.
@@ -92,7 +97,7 @@ class ScanFolder(FileSource):
         self._warnings: list[str] = []
         self._texts: list[Path] = []
         numbers = np.array([_number(file) for file in self._files], dtype=np.int64)
-        by_time = all(_TIME_NAME.fullmatch(file.stem) for file in self._files)
+        by_time = _names_ns(self._files) is not None
         if by_time or len(np.unique(numbers)) < len(numbers) or (numbers < 0).any():
             numbers = np.arange(len(numbers), dtype=np.int64)
         folder = self._files[0].parent
@@ -101,14 +106,15 @@ class ScanFolder(FileSource):
         others += folders_of_runs(folder)
         if others and not path.is_file():
             self._warnings.append(f"not part of this run are {named(others)}: open each of them by its name")
-        places = [] if path.is_file() else [folder, folder.parent]
+        # A relative path such as "." has no parents; links keep the folder in which they are.
+        folder = folder.resolve() if ".." in folder.parts else folder.absolute()
+        places = [] if path.is_file() else list(dict.fromkeys([folder, *folder.parents[:2]]))
         if path.is_file() and options.form == "auto":
             self._warnings += _form_words(path)
         self._timed = False
-        self._stamp = self._read_stamps(places, numbers)
+        self._stamp = self._read_stamps(places[:2], numbers)
         self._T_base_lidar = options.T_base_lidar or Pose3.identity()
-        self._poses = self._read_poses([*places, *(place.parent for place in places[1:])], numbers)
-        self._poses = self._poses or self._read_views()
+        self._poses = self._read_poses(places, numbers) or self._read_views()
         if self._poses is None and not self._timed and options.form != "scan":
             _refuse_clouds(self._files, self._suffix, uri)
         if self._poses is not None:
@@ -173,58 +179,84 @@ class ScanFolder(FileSource):
             reason = reason or f"{file.name} holds no points"
         raise SourceError(reason, where=uri, remedy=f"Files must be {self._kind} scans.")
 
-    def _read_texts(
-        self, places: list[Path], names: Iterable[str], read: Callable[[Path], T]
-    ) -> Iterator[tuple[Path, T]]:
-        """Yield the files of some names that exist and can be read, each with its contents. Missing files are
-        skipped; a file that cannot be read becomes a warning.
+    def _first_text(self, places: list[Path], names: Iterable[str], use: Callable[[Path], T]) -> T | None:
+        """Return the result for the first file of some names that can be used, which is added to the files of
+        the digest; None if there is none. Other files before it become warnings.
 
         Args:
             places: Folders, searched in this order.
             names: Names of the files.
-            read: Function of a path that returns the contents of the file.
+            use: Function of a path; raises TextError with the reason if the file cannot be used.
         """
         for path in [place / name for place in places for name in names]:
             try:
-                yield path, read(path)
+                found = use(path)
             except FileNotFoundError:
                 continue
             except (TextError, OSError) as error:
                 self._warnings.append(f"{path.name} is not used: {error}")
+                continue
+            self._texts.append(path)
+            return found
+        return None
 
     def _read_stamps(self, places: list[Path], numbers: Int) -> Int:
         """Return the time of each scan [ns], int64, shape (N,): by a file of times, by the names, or else
-        STEP_NS apart by the numbers. A file of times that is used is added to the files of the digest.
-        `_timed` is set to whether times were found.
+        STEP_NS apart by the numbers. `_timed` is set to whether times were found.
 
         Args:
             places: Folders that are searched.
             numbers: Number in the name of each scan file.
         """
-        for path, times in self._read_texts(places, TIMES, read_times):
-            rows = self._rows(path.name, len(times), numbers)
-            if rows is not None:
-                self._texts.append(path)
-                self._timed = True
-                return times[rows]
-        in_names = _times_in_names(self._files)
-        self._timed = in_names is not None
-        return numbers * STEP_NS if in_names is None else in_names
+
+        def in_file(path: Path) -> Int:
+            times = read_times(path)
+            return times[_rows(len(times), numbers)]
+
+        stamps = self._first_text(places, TIMES, in_file)
+        if stamps is None:
+            stamps = _times_in_names(self._files)
+        self._timed = stamps is not None
+        return numbers * STEP_NS if stamps is None else stamps
 
     def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3 | None] | None:
-        """Return the pose of each scan (None for scans without one) by the first file of poses that fits;
-        None if there is none. Times of its rows replace those of scans without times, and the file is added
-        to the files of the digest. Arguments as in `_read_stamps`."""
-        names = [*POSES, *_names_of_poses(places)]
-        for path, (times, poses) in self._read_texts(places, names, read_any_poses):
-            # Two folders above, there may be other runs: only times show that rows belong to this one.
-            if path.parent in places[2:] and (times is None or not self._timed):
-                continue
-            found = self._fitting(path.name, times, poses, numbers)
-            if found is not None:
-                self._texts.append(path)
-                return found
-        return None
+        """Return the pose of each scan (None for scans without one) by the first file of POSES that fits, or
+        the only one that fits by its name; None if there is none. Times of its rows replace those of scans
+        without times.
+
+        Args:
+            places: The folder, its parent and the parent of this.
+            numbers: Number in the name of each scan file.
+        """
+        found = self._first_text(places[:2], POSES, lambda path: self._fitting(path, numbers))
+        if found is None:
+            found = self._guessed(places)
+        if found is None:
+            return None
+        poses, times = found
+        if times is not None:
+            self._stamp, self._timed = times, True
+        return poses
+
+    def _guessed(self, places: list[Path]) -> Fit | None:
+        """Return the poses of the only text that has a word of poses in its name and fits the scans (see
+        `_fitting`), with a warning that names it; None if there is none, or if there are several, with a
+        warning. Arguments as in `_read_poses`."""
+        fits = list[tuple[Path, Fit]]()
+        for place in places if self._timed else places[:2]:
+            for path in _texts_of_poses(place):
+                with suppress(TextError, OSError):
+                    fits.append((path, self._fitting(path, None, by_time=place in places[2:])))
+        names = named(sorted(path.name for path, _ in fits))
+        if len(fits) > 1:
+            self._warnings.append(
+                f"none of {names} is used: each may have the poses; choose one with --odometry file:"
+            )
+        if len(fits) != 1:
+            return None
+        self._warnings.append(f"the motion is that in {names}, which was found by its name")
+        self._texts.append(fits[0][0])
+        return fits[0][1]
 
     def _read_views(self) -> list[Pose3 | None] | None:
         """Return the pose of the sensor in the header of each PCD file; None if most files have none."""
@@ -302,59 +334,58 @@ class ScanFolder(FileSource):
         points[nothing] = np.nan  # a beam without a return
         return scan_of(stamp_ns, {**columns, **dict(zip("xyz", points.T, strict=True))}, self._times)
 
-    def _fitting(
-        self, name: str, times: Int | None, poses: list[Pose3], numbers: Int
-    ) -> list[Pose3 | None] | None:
-        """Return a list of the pose of each scan, None for a scan without a pose. The result is None, with a
-        warning, if the rows of the file do not belong to the scans. Times of the rows become those of scans
-        without times.
+    def _fitting(self, path: Path, numbers: Int | None, *, by_time: bool = False) -> Fit:
+        """Return the pose of each scan, None for a scan without one, in a file of poses, and the times of
+        their rows for scans without times [ns], int64, shape (N,), or None.
 
         Args:
-            name: Name of the file.
-            times: Times of the rows of the file [ns]; None if it has none.
-            poses: Pose of each row.
-            numbers: Number in the name of each scan file.
+            path: The file.
+            numbers: Number in the name of each scan file, which may select its row; None for a file of which
+                only its name tells that it has poses: most scans must be at its times, or it must have as
+                many rows as there are scans.
+            by_time: Whether only times tell that the rows belong to the scans.
+
+        Raises:
+            TextError: The rows do not belong to the scans, or errors as those of `read_any_poses`.
+            OSError: The file cannot be read.
         """
+        times, rows = read_any_poses(path)
         if times is not None and self._timed:
-            found = [pose_at(times, poses, int(stamp_ns)) for stamp_ns in self._stamp]
-            if any(pose is not None for pose in found):
-                return found
-            self._warnings.append(f"{name} is not used: its times are not those of the scans")
-            return None
-        rows = self._rows(name, len(poses), numbers)
-        if rows is None:
-            return None
-        if times is not None:
-            self._stamp, self._timed = times[rows], True
-        return [poses[row] for row in rows.tolist()]
-
-    def _rows(self, name: str, count: int, numbers: Int) -> Int | None:
-        """Return the row of each scan in a text file, int64, shape (N,): the number of the scan if there are
-        enough rows, else its index if there are as many rows as scans; None (with a warning) if neither fits.
-
-        Args:
-            name: Name of the file.
-            count: Number of rows of the file.
-            numbers: Number in the name of each scan file, ascending; 0 is the first row.
-        """
-        if count > int(numbers[-1]):
-            return numbers
-        if count == len(numbers):
-            return np.arange(count, dtype=np.int64)
-        self._warnings.append(
-            f"{name} is not used: it has {count} rows, the scans are numbered up to {int(numbers[-1])}"
-        )
-        return None
+            poses = [pose_at(times, rows, int(stamp_ns)) for stamp_ns in self._stamp]
+            count = sum(pose is not None for pose in poses)
+            if not count or (numbers is None and 2 * count < len(poses)):
+                raise TextError("its times are not those of the scans")
+            return poses, None
+        if by_time or (numbers is None and len(rows) != len(self._files)):
+            raise TextError("its rows are not those of the scans")
+        chosen = _rows(len(rows), np.arange(len(rows)) if numbers is None else numbers)
+        return [rows[k] for k in chosen.tolist()], None if times is None else times[chosen]
 
 
-def _names_of_poses(places: list[Path]) -> list[str]:
-    """Return the sorted names of further texts in some folders that have poses by their names; those in
-    folders that cannot be read are left out."""
-    found = set[str]()
-    for place in places:
-        with suppress(OSError):
-            found.update(p.name for p in place.iterdir() if p.suffix in _TEXTS and _POSE_WORDS.search(p.stem))
-    return sorted(found.difference(POSES))
+def _rows(count: int, numbers: Int) -> Int:
+    """Return the row of each scan in a text file, int64, shape (N,): the number of the scan if there are
+    enough rows, else its index if there are as many rows as scans.
+
+    Args:
+        count: Number of rows of the file.
+        numbers: Number in the name of each scan file, ascending; 0 is the first row.
+
+    Raises:
+        TextError: Neither fits.
+    """
+    if count > int(numbers[-1]):
+        return numbers
+    if count == len(numbers):
+        return np.arange(count, dtype=np.int64)
+    raise TextError(f"it has {count} rows, the scans are numbered up to {int(numbers[-1])}")
+
+
+def _texts_of_poses(place: Path) -> list[Path]:
+    """Return the texts in a folder that may have poses by their names, sorted; [] if it cannot be read."""
+    try:
+        return sorted(p for p in place.iterdir() if p.suffix in _TEXTS and _POSE_WORDS.search(p.stem))
+    except OSError:
+        return []
 
 
 def _refuse_clouds(files: list[Path], suffix: str, uri: str) -> None:
@@ -415,31 +446,34 @@ def _scan_files(path: Path) -> tuple[str, list[Path]]:
 def _in_order(files: list[Path]) -> list[Path]:
     """Return files sorted by the times in their names if all names are times, else by the numbers at the ends
     of their names (those without a number first); equal ones by name."""
-    by_time = all(_TIME_NAME.fullmatch(file.stem) for file in files)
-    keys = _names_ns(files) if by_time else [_number(file) for file in files]
+    keys = _names_ns(files) or [_number(file) for file in files]
     return [file for _, _, file in sorted(zip(keys, [f.name for f in files], files, strict=True))]
 
 
 def _times_in_names(files: list[Path]) -> Int | None:
     """Return the times in the names of the files [ns], int64, shape (N,); None if a name is not a time, or
     the times do not strictly ascend."""
-    if not all(_TIME_NAME.fullmatch(file.stem) for file in files):
-        return None
     stamps = _names_ns(files)
-    return np.array(stamps, dtype=np.int64) if np.all(np.diff(stamps) > 0) else None
+    return None if stamps is None or np.any(np.diff(stamps) <= 0) else np.array(stamps, dtype=np.int64)
 
 
-def _names_ns(files: list[Path]) -> list[int]:
+def _names_ns(files: list[Path]) -> list[int] | None:
     """Return the times in the names of files [ns]: seconds with decimals, or seconds and a whole number of
-    smaller units, which may lack its leading zeros, or milli-, micro- or nanoseconds since 1970; 0 for other
-    names."""
-    words = [match.group(1) if (match := _TIME_NAME.fullmatch(file.stem)) else "0" for file in files]
+    smaller units, which may lack its leading zeros, or micro- or nanoseconds since 1970; None if a name is
+    not a time."""
+    matches = [match for file in files if (match := _TIME_NAME.fullmatch(file.stem))]
+    if len(matches) < len(files):
+        return None
+    words = [match.group(1) for match in matches]
     digits = max((len(word.partition("_")[2]) for word in words), default=0)
-    return [
-        seconds_ns(f"{whole}.{units.zfill(digits)}") if units else time_ns(word)
-        for word in words
-        for whole, _, units in [word.partition("_")]
-    ]
+    try:
+        return [
+            seconds_ns(f"{whole}.{units.zfill(digits)}") if units else time_ns(word)
+            for word in words
+            for whole, _, units in [word.partition("_")]
+        ]
+    except ValueError:  # too far away
+        return None
 
 
 def _number(file: Path) -> int:
@@ -505,7 +539,7 @@ def _kitti_sensor(scan: Scan) -> Sensor:
 
 #: Name, function that reads a file, and function that infers the LiDAR from the first scan, by suffix.
 FORMATS: dict[str, tuple[str, Loader, Callable[[Scan], Sensor]]] = {
-    ".bin": ("KITTI .bin", load_bin, _kitti_sensor),
+    ".bin": (".bin", load_bin, _kitti_sensor),
     ".pcd": ("PCD", load_table, sensor_of),
     ".ply": ("PLY", load_table, sensor_of),
     ".npy": ("NumPy", load_table, sensor_of),

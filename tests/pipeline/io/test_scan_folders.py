@@ -255,6 +255,7 @@ def test_rows_of_bin_files_are_those_of_the_data_set(layout: str, tmp_path: Path
     for k in range(3):
         (tmp_path / f"{1_326_030_975_726_043 + k * 100_000}.bin").write_bytes(written(layout, points(k)))
     source = opened(tmp_path)
+    assert source.description.kind == ".bin"
     scans = [record for record in source.records() if isinstance(record, Scan)]
     np.testing.assert_allclose(scans[1].points, points(1), atol=3e-3)
     assert scans[1].stamp_ns - scans[0].stamp_ns == 10**8
@@ -355,3 +356,118 @@ def test_a_folder_of_tiles_of_a_cloud_is_no_drive(tmp_path: Path):
         las.write(str(tmp_path / f"plot_{int(east)}.laz"))
     with pytest.raises(SourceError, match=r"its 2 \.laz files are clouds or tiles of one"):
         open_source(str(tmp_path))
+
+
+def untimed(folder: Path, count: int) -> None:
+    """Scans without times."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(count):
+        write(folder / f"{k:06d}.bin", k)
+
+
+def timed(folder: Path, count: int) -> None:
+    """Scans with times in their names, ten a second."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(count):
+        write(folder / f"{START_S}.{k}00000000.npy", k)
+
+
+@pytest.mark.parametrize(
+    ("where", "given"),
+    [("", "."), ("", "velodyne"), ("velodyne", "."), ("velodyne/deeper", "..")],
+)
+def test_a_relative_folder_has_its_poses(
+    where: str, given: str, tmp_path: Path, opened: Opened, monkeypatch: pytest.MonkeyPatch
+):
+    untimed(tmp_path / "00" / "velodyne", 4)
+    (tmp_path / "00" / "velodyne" / "deeper").mkdir()
+    (tmp_path / "00" / "poses.txt").write_text(matrices(curve(4)))
+    monkeypatch.chdir(tmp_path / "00" / where)
+    assert opened(Path(given)).description.has_odometry
+
+
+def test_a_linked_folder_has_the_poses_beside_the_link(tmp_path: Path, opened: Opened):
+    untimed(tmp_path / "disk" / "scans", 4)
+    (tmp_path / "00").mkdir()
+    (tmp_path / "00" / "velodyne").symlink_to(tmp_path / "disk" / "scans")
+    (tmp_path / "00" / "poses.txt").write_text(matrices(curve(4)))
+    assert opened(tmp_path / "00" / "velodyne").description.has_odometry
+
+
+@pytest.mark.parametrize("rows", [3, 5, 20])
+def test_rows_of_a_text_found_by_its_name_are_as_many_as_the_scans(rows: int, tmp_path: Path, opened: Opened):
+    """Rows at another rate have no scan; for the usual names the number of a scan is its row."""
+    untimed(tmp_path, 4)
+    (tmp_path / "odometry.csv").write_text(tum(curve(rows)))
+    description = opened(tmp_path).description
+    assert not description.has_odometry
+    assert not description.has_times
+    assert not any("odometry.csv" in text for text in description.warnings)
+    (tmp_path / "odometry.csv").write_text(tum(curve(4)))
+    description = opened(tmp_path).description
+    assert description.has_odometry
+    assert description.has_times
+    assert "the motion is that in odometry.csv, which was found by its name" in description.warnings
+
+
+def test_several_texts_found_by_their_names_are_not_chosen_from(tmp_path: Path, opened: Opened):
+    timed(tmp_path, 4)
+    for name in ("gps_odom.csv", "lidar_odom.csv"):
+        (tmp_path / name).write_text(tum(curve(9)))
+    description = opened(tmp_path).description
+    assert not description.has_odometry
+    assert any("none of gps_odom.csv, lidar_odom.csv is used" in text for text in description.warnings)
+    (tmp_path / "poses.txt").write_text(tum(curve(9)))
+    description = opened(tmp_path).description
+    assert description.has_odometry
+    assert not any("odom.csv" in text for text in description.warnings)
+
+
+def test_a_text_found_by_its_name_has_the_times_of_most_scans(tmp_path: Path, opened: Opened):
+    folder = tmp_path / "sensor" / "lidar"
+    folder.mkdir(parents=True)
+    for k in range(8):
+        write(folder / f"{START_S + k}.0.npy", k)
+    for place in (folder, tmp_path):
+        text = place / "traj_a.txt"
+        text.write_text(tum(curve(9), START_S + 6))
+        assert not opened(folder).description.has_odometry
+        text.write_text(tum(curve(90), START_S))
+        assert opened(folder).description.has_odometry
+        text.unlink()
+
+
+@pytest.mark.parametrize("name", ["purpose.txt", "exposed_plots.csv", "odometer.md", "pose_notes.txt"])
+@pytest.mark.parametrize("above", range(3))
+def test_other_texts_are_not_mentioned(name: str, above: int, tmp_path: Path, opened: Opened):
+    folder = tmp_path / "a" / "b"
+    timed(folder, 3)
+    before = opened(folder).description.warnings
+    ([folder, *folder.parents][above] / name).write_text("1 2 3\n4 5 6\n")
+    assert opened(folder).description.warnings == before
+
+
+@pytest.mark.parametrize(
+    "name", ["exposed.csv", "purpose.csv", "trajector.csv", "odometry.csv", "LIO_Odom-1.csv"]
+)
+def test_whole_words_tell_poses(name: str, tmp_path: Path, opened: Opened):
+    timed(tmp_path, 3)
+    (tmp_path / name).write_text(tum(curve(3)))
+    assert opened(tmp_path).description.has_odometry == (name[:2] not in ("ex", "pu"))
+
+
+def test_rows_two_folders_above_need_times(tmp_path: Path, opened: Opened):
+    timed(tmp_path / "a" / "b", 4)
+    (tmp_path / "poses.txt").write_text(matrices(curve(4)))
+    assert not opened(tmp_path / "a" / "b").description.has_odometry
+    (tmp_path / "poses.txt").write_text(tum(curve(4)))
+    assert opened(tmp_path / "a" / "b").description.has_odometry
+
+
+@pytest.mark.parametrize("first", [9_300_000_000_000_000_000, 8_999_999_999_999_999_000])
+def test_names_too_far_away_in_time_are_numbers(first: int, tmp_path: Path, opened: Opened):
+    for k in range(3):
+        write(tmp_path / f"{first + k}.npy", k)
+    description = opened(tmp_path).description
+    assert not description.has_times
+    assert description.scans == 3
