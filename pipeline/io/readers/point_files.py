@@ -219,7 +219,8 @@ def _metres(columns: Columns) -> Columns:
 def _are_rows(columns: Columns) -> bool:
     """Return whether nearly all rows without NaN have coordinates of a scan and a reflectance, and there are
     such rows."""
-    rows = np.column_stack([columns[name].astype(np.float64) for name in _ROWS[0][1]])
+    with np.errstate(invalid="ignore"):  # signalling NaN, in a damaged file
+        rows = np.column_stack([columns[name].astype(np.float64) for name in _ROWS[0][1]])
     x, y, z, reflectance = rows[~np.isnan(rows).any(axis=1)].T
     sound = (np.maximum(np.abs(x), np.abs(y)) < RANGE_LIMIT) & (np.abs(z) < _HIGHEST) & (reflectance >= 0.0)
     return bool(sound.size and sound.mean() > _FITTING)

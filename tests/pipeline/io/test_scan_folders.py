@@ -282,6 +282,12 @@ def test_rows_of_nan_do_not_tell_the_layout(layout: str, tmp_path: Path):
     assert open_points(path).kind == f"{layout} .bin"
 
 
+def test_signalling_nan_gives_no_warning(tmp_path: Path):
+    path = tmp_path / "000000.bin"
+    path.write_bytes(4 * b"\x01\x00\x80\x7f" + written("KITTI", points(0)))
+    assert open_points(path).kind == "KITTI .bin"
+
+
 def test_a_few_rows_are_those_of_kitti(tmp_path: Path):
     path = tmp_path / "000000.bin"
     path.write_bytes(written("NCLT", points(0))[:8])
