@@ -143,8 +143,8 @@ def _named_columns(names: list[str]) -> tuple[list[int], list[int]]:
 
 def _named_lines(path: Path) -> tuple[list[str], list[list[str]]]:
     """Return the names of the columns in the first line, in lower case without units and signs of a comment,
-    and the words of the rows; errors as `_lines`. The names are [] if the line has numbers, or is a comment
-    with another number of words than a row."""
+    and the words of the rows; errors as `_lines`. The names are [] if the line has numbers, too few
+    words for a pose, or is a comment with another number of words than a row."""
     text = _text(path)
     first, _, rest = text.partition("\n")
     line = first.strip().rstrip(",; ")
@@ -154,7 +154,8 @@ def _named_lines(path: Path) -> tuple[list[str], list[list[str]]]:
         return [], _words(text)
     rows = _words(rest)
     is_comment = first.startswith(("#", "%")) and rows and len(names) != len(rows[0])
-    return (names, rows) if rows and not is_comment else ([], _words(text))
+    is_header = rows and not is_comment and len(names) >= TUM_COLUMNS - 1
+    return (names, rows) if is_header else ([], _words(text))
 
 
 def _times(stamps: Iterable[list[str]]) -> Int:

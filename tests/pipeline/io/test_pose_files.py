@@ -122,3 +122,10 @@ def test_a_byte_order_mark_is_no_number(tmp_path: Path):
     assert len(read_any_poses(path)[1]) == 3
     path.write_text(f"{START_S}.5\n", "utf-8-sig")
     assert read_times(path).tolist() == [START_S * 10**9 + 5 * 10**8]
+
+
+def test_a_text_without_a_table_is_refused_by_its_columns(tmp_path: Path):
+    path = tmp_path / "poses.txt"
+    path.write_text("t0\nheader:\n  seq: 19844\n")
+    with pytest.raises(TextError, match="its rows have 1 columns; readable are"):
+        read_any_poses(path)
