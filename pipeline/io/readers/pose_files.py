@@ -51,7 +51,9 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
         OSError: The file cannot be read.
     """
     names, lines = _named_lines(path)
-    columns = len(lines[0]) if lines else 0
+    if not lines:
+        raise TextError("it has no rows")
+    columns = len(lines[0])
     found = _named_columns(names) if names else _COLUMNS.get(columns)
     if found is None:
         raise TextError(f"its rows have {columns} columns; readable are {POSE_ROWS}")

@@ -258,8 +258,8 @@ def test_a_missing_trajectory(tmp_path: Path, opened: Opened):
 @pytest.mark.parametrize(
     ("text", "word"),
     [
-        ("", "8 numbers"),
-        ("1 2 3\n", "8 numbers"),
+        ("", "no rows"),
+        ("1 2 3\n", "3 columns"),
         ("1 0 0 0 0 0 0 one\n", "words"),
         ("1 0 0 0 0 0 0 nan\n", "finite"),
         ("1 0 0 0 0 0 0 0\n", "quaternion"),
