@@ -133,7 +133,7 @@ def test_the_number_of_a_file_is_its_row(tmp_path: Path, opened: Opened):
         ("1 " * 12, "rotations"),
         ("1 0 0 0 0 -1 0 0 0 0 1 0\n" * 11, "rotations"),
         ("x " * 12, "words"),
-        ("", "12 numbers"),
+        ("", "no rows"),
     ],
 )
 def test_poses_that_do_not_fit_are_left_aside_with_a_warning(
