@@ -112,11 +112,15 @@ def test_a_folder_with_one_recording_that_is_no_run_is_that_recording(tmp_path: 
 
 @pytest.mark.parametrize("beside", ["LOAM/GlobalMap.pcd", "drive/more.bag"])
 def test_a_single_recording_is_opened_whatever_folders_are_beside_it(beside: str, tmp_path: Path):
-    (tmp_path / "run.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    recording = tmp_path / "run.bag"
+    recording.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
     (tmp_path / beside).parent.mkdir()
     (tmp_path / beside).touch()
-    with pytest.raises(SourceError, match=r"run\.bag"):
+    with pytest.raises(SourceError) as of_file:
+        open_source(str(recording))
+    with pytest.raises(SourceError) as of_folder:
         open_source(str(tmp_path))
+    assert str(of_folder.value) == str(of_file.value)
 
 
 def test_folders_of_results_are_no_runs(tmp_path: Path):
