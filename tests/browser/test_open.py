@@ -19,7 +19,7 @@ SOURCE = "sim:stand?duration=5"
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A data folder with recordings in folders; they are listed by their names."""
     made: Path = tmp_path_factory.mktemp("data") / "recordings"
-    for name in ("spring/north stand.pcap", "spring/south stand.pcap", "autumn/plot.e57"):
+    for name in ("spring/north stand.mcap", "spring/south stand.mcap", "autumn/plot.laz"):
         file = made / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(b"")
@@ -56,7 +56,7 @@ def test_recordings_are_a_tree_and_simulated_runs_are_folded(dialog: Page) -> No
     expect(listed.get_by_text("spring/", exact=True)).to_be_visible()
     expect(listed.get_by_text("sim:long", exact=True)).to_be_hidden()
     listed.get_by_text("spring/", exact=True).click()
-    expect(listed.get_by_text("north stand.pcap", exact=True)).to_be_visible()
+    expect(listed.get_by_text("north stand.mcap", exact=True)).to_be_visible()
     listed.get_by_text("Simulated, with ground truth").click()
     expect(listed.get_by_text("sim:long", exact=True)).to_be_visible()
 
@@ -65,9 +65,9 @@ def test_what_is_typed_filters_and_tab_completes(dialog: Page, folder: Path) -> 
     field, shown = dialog.locator("#source-uri"), dialog.locator("#source-list button:visible")
     field.press_sequentially("south")
     expect(shown).to_have_count(1)
-    expect(shown).to_contain_text("south stand.pcap")
+    expect(shown).to_contain_text("south stand.mcap")
     field.press("Tab")
-    expect(field).to_have_value(str(folder / "spring" / "south stand.pcap"))
+    expect(field).to_have_value(str(folder / "spring" / "south stand.mcap"))
     field.fill("sim:stand")  # an address that others begin with
     field.press("Tab")
     expect(field).to_have_value("sim:stand")
@@ -77,11 +77,11 @@ def test_what_is_typed_filters_and_tab_completes(dialog: Page, folder: Path) -> 
 
 
 def test_a_near_miss_is_suggested(dialog: Page, folder: Path) -> None:
-    dialog.locator("#source-uri").fill(str(folder / "spring" / "nort stand.pcap"))
+    dialog.locator("#source-uri").fill(str(folder / "spring" / "nort stand.mcap"))
     dialog.locator("#source-open").click()
     near = dialog.locator("#source-near")
     expect(near).to_contain_text("Did you mean")
-    expect(near.get_by_role("button").first).to_have_text(str(folder / "spring" / "north stand.pcap"))
+    expect(near.get_by_role("button").first).to_have_text(str(folder / "spring" / "north stand.mcap"))
 
 
 def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extensions(
