@@ -148,7 +148,7 @@ class FastSlam:
         reach = _farthest(detections) if used else 0.0
         estimate, frame, by_trees = _estimate(state, self._best_map(state), weights, p, reach)
         if births is not None:
-            state = self._with_places(state, births[state.best], detections.centre, R, estimate, reach)
+            state = self._with_places(state, births[state.best].copy(), detections.centre, R, estimate, reach)
         if used:
             at = estimate.T_map_base.as_array()
             corrected = state.shared.corrected(at, estimate.covariance if by_trees else None)
@@ -173,7 +173,7 @@ class FastSlam:
             landmark_of = births_of(detections, estimate, self._usable_landmarks())
             scan = ScanStatistics(len(landmark_of), recognised=float(np.count_nonzero(landmark_of >= 0)))
         else:
-            landmark_of = births[state.best]
+            landmark_of = births[state.best].copy()  # a view would keep the births of all particles
             self.state = self._with_keyframe(state, detections, landmark_of)
         health = pose_health(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.local_covariance, doubt

@@ -191,6 +191,13 @@ def test_a_landmark_s_covariance_stays_positive(Sigma, R, times):
     assert np.linalg.eigvalsh(_full(P))[0] >= VARIANCE_MIN * (1.0 - 1e-9)
 
 
+def test_an_estimate_keeps_no_memory_of_all_particles():
+    slam = fresh()
+    for k in range(3):
+        estimate = slam.process(k, Pose2(), detections([[4.0, 1.0], [2.0, 5.0]]), NOTHING_SEEN)
+        assert estimate.landmark_of.base is None
+
+
 def test_a_tree_seen_often_is_one_landmark_at_its_place():
     slam = fresh(view_range=0.0)
     told = [slam.process(k, Pose2(), detections([[4.0, 1.0]]), NOTHING_SEEN) for k in range(30)]
