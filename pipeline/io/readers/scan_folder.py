@@ -94,6 +94,9 @@ class ScanFolder(FileSource):
         self._T_file_lidar: dict[Path, Pose3] = {}
         if not self._files:
             raise SourceError(f"the folder has no {self._suffix} files", where=uri)
+        if self._suffix == ".bin":
+            with suppress(ScanFileError, OSError):  # the loading of the scan states the reason
+                self._kind = open_rows(self._files[0]).kind
         self._warnings: list[str] = []
         self._texts: list[Path] = []
         numbers = np.array([_number(file) for file in self._files], dtype=np.int64)

@@ -143,7 +143,12 @@ def test_a_lidar_on_its_side_is_named_rather_than_the_odometry(tmp_path: Path, o
 
 
 @pytest.mark.parametrize(
-    ("roll", "pitch", "lidar"), [(60, 0, "os0-128"), (0, 50, "mid360"), (90, 0, "vlp16")]
+    ("roll", "pitch", "lidar"),
+    [
+        pytest.param(60, 0, "os0-128", marks=pytest.mark.slow),
+        pytest.param(0, 50, "mid360", marks=pytest.mark.slow),
+        (90, 0, "vlp16"),
+    ],
 )
 def test_a_lidar_on_its_side_whose_motion_shows_the_yaw_is_no_loss(
     roll: float, pitch: float, lidar: str, tmp_path: Path, opened: Opened

@@ -255,7 +255,7 @@ def test_rows_of_bin_files_are_those_of_the_data_set(layout: str, tmp_path: Path
     for k in range(3):
         (tmp_path / f"{1_326_030_975_726_043 + k * 100_000}.bin").write_bytes(written(layout, points(k)))
     source = opened(tmp_path)
-    assert source.description.kind == ".bin"
+    assert source.description.kind == f"{layout} .bin"
     scans = [record for record in source.records() if isinstance(record, Scan)]
     np.testing.assert_allclose(scans[1].points, points(1), atol=3e-3)
     assert scans[1].stamp_ns - scans[0].stamp_ns == 10**8
