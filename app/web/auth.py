@@ -37,7 +37,7 @@ from pipeline.io.atomic_files import write_beside
 
 # The only route whose bodies may be as large as a recording.
 UPLOADS = "/api/uploads"
-#: What a viewer is told who asks for more, and what to do.
+#: Error and remedy for a request of a viewer that only an owner may make.
 VIEW_ONLY, ASK_OWNER = "this is a view-only link", "Ask the person who runs stemmap for the owner's link"
 # The only route without a token: for the supervisor of a service.
 HEALTH = "/health"

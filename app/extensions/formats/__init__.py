@@ -58,7 +58,7 @@ def _formats() -> tuple[Format | PacketFormat, ...]:
             accepts=_later("text_points", "is_text_of_points"),
         ),
         Format(stems, (), (), _later("tree_manager", "TreeManagerSource"), is_folder=_is_tree_manager),
-        PacketFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "PacketDecoder")),
+        PacketFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "HesaiDecoder")),
         PacketFormat(
             "raw packets of Ouster", OUSTER_PACKETS, recording=_later("ouster", "with_packets_decoded")
         ),

@@ -232,7 +232,7 @@ class PcapSource(FileSource):
         """
         self._losses = losses = dict[str, int]()
         of_hesai = int(self._packets["product"][0]) >= _HESAI
-        decoder: SweepDecoder = hesai.PacketDecoder() if of_hesai else velodyne.PacketDecoder()
+        decoder: SweepDecoder = hesai.HesaiDecoder() if of_hesai else velodyne.VelodyneDecoder()
         for sweep in range(len(self._first)):
             rows = range(int(self._first[sweep]), int(self._last[sweep]) + 1)
             stamps = self._packets["stamp_ns"][rows.start : rows.stop].tolist()

@@ -242,7 +242,7 @@ def decode_hesai(
     return scan, model
 
 
-class PacketDecoder:
+class HesaiDecoder:
     """Decodes the packets of one sensor, one sweep at a time, see `pipeline.io.readers.packets`."""
 
     def is_data(self, packet: bytes) -> bool:

@@ -387,8 +387,9 @@ def recordings_in(folder: Path) -> list[str]:
 
 
 def runs_in(folder: Path) -> list[str]:
-    """Return the names of the runs in a folder that is none itself: its only recording, whatever folders are
-    beside it, else its recordings and its folders with runs. OSError if it cannot be read."""
+    """Return the names of the runs in a folder that is no run itself. A single recording is the only run,
+    whatever folders are beside it; otherwise all recordings and folders with runs are returned. OSError if
+    the folder cannot be read."""
     names = recordings_in(folder)
     return names if len(names) == 1 else names + folders_of_runs(folder)
 

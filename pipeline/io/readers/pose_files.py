@@ -56,7 +56,7 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
     columns = len(lines[0])
     found = _named_columns(names) if names else _COLUMNS.get(columns)
     if found is None:
-        raise TextError(f"its rows have {columns} columns; readable are {POSE_ROWS}")
+        raise TextError(f"its rows have {columns} column{'s' * (columns != 1)}; readable are {POSE_ROWS}")
     if names:
         columns = len(names)
     if any(len(line) != columns for line in lines):

@@ -44,7 +44,7 @@ from pipeline.io.readers.topics import (
     decode,
 )
 from pipeline.io.readers.transforms import TransformTree, frame_name, pose_of
-from pipeline.io.readers.velodyne import PacketDecoder
+from pipeline.io.readers.velodyne import VelodyneDecoder
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor
 from pipeline.types.units import SECOND_NS
 
@@ -214,7 +214,7 @@ class RecordDecoder:
     ) -> None:
         """Create a decoder without a base frame and frames of measured poses."""
         self._channels, self._tree = channels, tree
-        self._decoders: dict[str, SweepDecoder] = {VELODYNE_SCAN: PacketDecoder()}
+        self._decoders: dict[str, SweepDecoder] = {VELODYNE_SCAN: VelodyneDecoder()}
         self.base = ""
         self.frames: dict[str, GnssFrame | OtherFrame] = {}
         self._poses = poses

@@ -92,7 +92,7 @@ class Rotation:
         return True
 
 
-class PacketDecoder:
+class VelodyneDecoder:
     """Decodes the packets of one sensor, one sweep at a time."""
 
     def __init__(self) -> None:

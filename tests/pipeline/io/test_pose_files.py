@@ -127,5 +127,5 @@ def test_a_byte_order_mark_is_no_number(tmp_path: Path):
 def test_a_text_without_a_table_is_refused_by_its_columns(tmp_path: Path):
     path = tmp_path / "poses.txt"
     path.write_text("t0\nheader:\n  seq: 19844\n")
-    with pytest.raises(TextError, match="its rows have 1 columns; readable are"):
+    with pytest.raises(TextError, match="its rows have 1 column; readable are"):
         read_any_poses(path)
