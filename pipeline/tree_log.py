@@ -21,8 +21,10 @@ from pipeline.loop_closure.detection import RunHistory
 from pipeline.slam import Loop
 from pipeline.types.records import Columns, Detections, Landmarks, PoseEstimate
 
-MOST_BYTES = 256 << 20  # of one log; ten minutes of a dense forest take about 100 MB
-SCAN_BYTES, LANDMARK_BYTES = 6000, 56  # of a scan with 25 detections without landmarks, and of a landmark
+MOST_BYTES = 150_000_000  # of one log; ten minutes of a dense forest take about 130 MB
+#: Memory of a scan without the contents of its 20 arrays, and of these contents for each detection and for
+#: each landmark [bytes].
+SCAN_BYTES, DETECTION_BYTES, LANDMARK_BYTES = 4000, 120, 56
 #: Parameters, by stage, that act on the trees only.
 OF_TREES = {"tracking": None, "classification": {"tree_share"}, "evaluation": None, "obstacles": None}
 
@@ -82,25 +84,35 @@ class TreeInput:
 
 
 class TreeLog:
-    """What each scan of a run gave to its trees. A log of more than MOST_BYTES is empty from then on."""
+    """What each scan of a run gave to its trees.
 
-    def __init__(self) -> None:
+    Args:
+        most: Memory that the log takes at most [bytes]. Beyond it, the log is empty and remains so: without
+            the first scans, the trees cannot be made from it.
+
+    Attributes:
+        nbytes: Memory that it takes, approximately [bytes].
+    """
+
+    def __init__(self, most: int = MOST_BYTES) -> None:
         self._scans: list[TreeInput | None] = []
         self._sizes: list[int] = []
-        self._nbytes = 0
+        self._most, self.nbytes = most, 0
+        self._is_over = False
         self._columns: Columns | None = None  # the last ones, with axes and votes only
 
     def put(self, index: int, known: TreeInput | None) -> None:
         """Store the input of a scan, in place of an earlier one; None if the trees cannot be made from it."""
-        if index > len(self._scans) or self._nbytes > MOST_BYTES:
+        if index > len(self._scans) or self._is_over:
             return
         size = 0 if known is None else _size(known, self._scans[index - 1] if index else None)
         if index == len(self._scans):
             self._scans.append(None)
             self._sizes.append(0)
-        self._nbytes += size - self._sizes[index]
+        self.nbytes += size - self._sizes[index]
         self._scans[index], self._sizes[index] = known, size
-        if self._nbytes > MOST_BYTES:
+        if self.nbytes > self._most:
+            self._is_over, self.nbytes = True, 0
             self._scans.clear()
             self._sizes.clear()
 
@@ -114,9 +126,9 @@ class TreeLog:
 
     def until(self, scans: int) -> TreeLog:
         """Return a log of the first scans, which must be known. The entries are shared."""
-        log = TreeLog()
+        log = TreeLog(self._most)
         log._scans, log._sizes = self._scans[:scans], self._sizes[:scans]
-        log._nbytes = sum(log._sizes)
+        log.nbytes = sum(log._sizes)
         return log
 
     def at(self, index: int) -> TreeInput:
@@ -136,7 +148,9 @@ def _size(known: TreeInput, before: TreeInput | None) -> int:
     landmarks and columns are shared by the scans that do not change them."""
     size = SCAN_BYTES + sum(2 * each.correction.after.nbytes for each in known.corrections)
     if known.votes is not None and known.columns is not None:
-        size += known.votes.nbytes + known.columns.axis.nbytes
+        size += known.votes.nbytes + known.columns.axis.nbytes + known.columns.share.nbytes
+    if known.seen is not None:
+        size += DETECTION_BYTES * len(known.seen[0].centre)
     shared = before.seen[1].birth if before is not None and before.seen is not None else None
     if known.seen is not None and known.seen[1].birth is not shared:
         size += LANDMARK_BYTES * len(known.seen[1].birth)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
@@ -30,6 +30,8 @@ VARIABLES: dict[str, str] = {
     " default: any for requests from this machine, folders for others; set folders behind a proxy or tunnel",
     "STEMMAP_EXTENSIONS": "extensions that are switched on, with commas between; empty: none (default: all)",
     "STEMMAP_UPLOAD_GB": "largest recording that a browser may upload, in GB (default: 20)",
+    "STEMMAP_RUN_GB": "temporary files of a run, from which it is shown and mapped again, in GB (default: 2)",
+    "STEMMAP_RUN_MEMORY_MB": "memory of a run from which its trees are made again, in MB (default: 450)",
 }
 
 Files = Literal["", "any", "folders"]
@@ -37,6 +39,50 @@ Files = Literal["", "any", "folders"]
 #: Largest body of a request that is no upload, and largest websocket message of a browser [bytes].
 BODY_LIMIT = MESSAGE_LIMIT = 1_000_000
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
+
+
+class RunBudget(NamedTuple):
+    """What a run keeps at most to go back and to map again without its source [bytes]. There are up to three
+    maps (the current one, that before the last change, one in the making) and three sets of segmented scans.
+
+    Attributes:
+        files: Temporary files.
+        memory: What the trees of the maps are made of.
+    """
+
+    files: int = 2_000_000_000
+    memory: int = 450_000_000
+
+    @property
+    def scans(self) -> int:
+        """Share of the files for the scans of the source."""
+        return self.files // 2
+
+    @property
+    def results(self) -> int:
+        """Share of the files for the results of one map; a sixteenth is left to states of the mapper."""
+        return self.files // 16
+
+    @property
+    def segmented(self) -> int:
+        """Share of the files for the scans that are segmented with one set of parameters."""
+        return self.files // 12
+
+    @property
+    def tree_log(self) -> int:
+        """Share of the memory for one map."""
+        return self.memory // 3
+
+
+DEFAULT_BUDGET = RunBudget()
+
+
+class RunStorage(NamedTuple):
+    """What a run keeps at present [bytes], and its budget."""
+
+    files: int
+    memory: int
+    budget: RunBudget
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +101,7 @@ class Settings:
             file in requests from this machine and only the data folders in others.
         opens_browser: Whether the page is opened in the browser of this machine.
         prints_viewer_link: Whether the view-only link is printed at the start.
+        run_budget: What a run keeps at most.
     """
 
     host: str = DEFAULT_HOST
@@ -67,6 +114,7 @@ class Settings:
     files: Files = ""
     opens_browser: bool = False
     prints_viewer_link: bool = False
+    run_budget: RunBudget = DEFAULT_BUDGET
 
     @property
     def uploads(self) -> Path | None:
@@ -141,6 +189,8 @@ class Environment(msgspec.Struct, frozen=True, rename=lambda name: f"STEMMAP_{na
     recordings: str = ""
     files: Files = ""
     upload_gb: Annotated[float, Meta(gt=0.0, le=1e6)] = 20.0
+    run_gb: Annotated[float, Meta(gt=0.0, le=1e6)] = 2.0
+    run_memory_mb: Annotated[float, Meta(gt=0.0, le=1e6)] = 450.0
 
 
 def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
@@ -179,4 +229,5 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         folder=data_folder(variables),
         files=given.files,
         upload_limit=round(1e9 * given.upload_gb),
+        run_budget=RunBudget(round(1e9 * given.run_gb), round(1e6 * given.run_memory_mb)),
     )

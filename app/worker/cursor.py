@@ -25,18 +25,24 @@ from pipeline.types.records import Step
 if TYPE_CHECKING:
     from app.robot.source import LiveSource
 
-MOST_STEP_BYTES = 4 << 30  # of the steps of a source; a scan of 30,000 points takes 0.3 MB
-
 
 class StepStore:
-    """The steps of a source in a temporary file of at most MOST_STEP_BYTES."""
+    """The last steps that were read from a source, in a temporary file. A scan of 30,000 points takes 0.3 MB.
 
-    def __init__(self) -> None:
-        self._blocks = BlockFile(MOST_STEP_BYTES)
+    Args:
+        most: Maximum size of the file [bytes].
+    """
+
+    def __init__(self, most: int) -> None:
+        self._blocks = BlockFile(most, drops_oldest=True)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the file [bytes]."""
+        return self._blocks.nbytes
 
     def put(self, step: Step) -> None:
-        """Store a step, unless one of its index is stored. Nothing is raised if the file or the disk is
-        full."""
+        """Store a step, unless one of its index is stored. Nothing is raised if the disk is full."""
         if step.index not in self._blocks:
             self._blocks.put_block(step.index, record_bytes(step))
 

@@ -51,11 +51,13 @@ def new_session(open_source: OpenSource = open_any_or_one_step) -> Session:
     Args:
         open_source: Opens a source by its URI and options.
     """
+    from app.common.settings import from_environment
     from app.store.forests import mapper_of
     from app.worker.numba_warmup import compiling, warm_up
 
     return Session(
         open_source=open_source,
+        budget=from_environment().run_budget,
         make_mapper=mapper_of,
         parameters=Parameters(),
         compiling=compiling,

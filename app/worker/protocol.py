@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from app.common.settings import RunStorage
 from app.explain.records import ClusterStory, MapSection, TreeStory
 from app.sources.one_step import OneStep
 from app.sources.request import SourceRequest
@@ -72,6 +73,7 @@ class Status:
         camera: Whether the source has camera pictures.
         recording: State of the recording of a live run; empty if there is none.
         one_step: What is known of a source that is mapped in one step; None for a run of scans.
+        storage: What a run of scans keeps; None without one.
     """
 
     state: State
@@ -106,6 +108,7 @@ class Status:
     compiling_since_s: float | None = None
     one_step: OneStep | None = None
     compiled: float | None = None
+    storage: RunStorage | None = None
     kernels_left: int | None = None
     unmapped: int = 0
 

@@ -17,6 +17,7 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
+from app.common.settings import RunBudget
 from app.worker.course import READ_QUANTITIES, ScanCounts, ScanSeries, TreeHistory, read_quantities
 from app.worker.protocol import (
     MapChanges,
@@ -40,8 +41,6 @@ from pipeline.seen_area import ViewSelection
 from pipeline.tree_log import TreeLog, TreesDifferError, differ_in_trees_only
 from pipeline.types.records import Columns, Float, Float32, Frame, Path, Step, Trees, Verdict
 from pipeline.types.units import SECOND_NS
-
-MOST_FRAME_BYTES = 1 << 30  # of the frames of one map; a scan takes 20 to 100 kB
 
 
 class StoredScan(msgspec.Struct, frozen=True):
@@ -83,14 +82,18 @@ class OtherTrees(NamedTuple):
 
 
 class FrameStore:
-    """The frames of one map without their points, each with the path and the confirmation times of its time.
+    """The last frames of one map without their points, each with the path and the confirmation times of its
+    time. A scan takes 10 to 100 kB.
 
     In memory are the newest path and the position of each scan in the file. The rows of the path that a
     correction replaced are in the file.
+
+    Args:
+        most: Maximum size of the file [bytes].
     """
 
-    def __init__(self) -> None:
-        self._blocks = BlockFile(MOST_FRAME_BYTES)
+    def __init__(self, most: int) -> None:
+        self._blocks = BlockFile(most, drops_oldest=True)
         self._codec: MessageCodec[StoredScan] = MessageCodec(StoredScan)
         self._scans = 0
         self._path: Path | None = None  # after the last scan
@@ -115,7 +118,7 @@ class FrameStore:
     def put(self, frame: Frame, path: Path, time_s: float, confirmed_s: Float) -> None:
         """Store the results of the scan after the last stored one; any other scan is ignored, also one that
         is stored. A scan that is larger than LARGEST_MESSAGE counts as stored, but cannot be read. Once a
-        scan cannot be written, because the file or the disk is full, no later one is stored.
+        scan cannot be written, because the disk is full, no later one is stored.
 
         Args:
             frame: Results of the scan; its points are not stored.
@@ -131,7 +134,7 @@ class FrameStore:
             replaced = rows_of(self._path, slice(start, None))
         objects = (frame.columns, frame.ground)
         columns_in, ground_in = (
-            -1 if value is None else last_in if value is last else frame.index
+            self._holder(value, last, last_in, frame.index)
             for value, last, last_in in zip(objects, self._objects, self._objects_in, strict=True)
         )
         no_points: Float32 = np.zeros((0, 3), np.float32)
@@ -154,6 +157,13 @@ class FrameStore:
             self._corrections.append((frame.index, start))
         self._scans += 1
         self._path, self._objects, self._objects_in = path, objects, (columns_in, ground_in)
+
+    def _holder(self, value: object, last: object, last_in: int, index: int) -> int:
+        """Return the scan in which columns or ground of a scan are stored; -1 for none. What has not changed
+        is stored again before the scan that has it is dropped."""
+        if value is None:
+            return -1
+        return last_in if value is last and self._blocks.is_new(last_in) else index
 
     def read(self, index: int) -> Shown | None:
         """Return the results of a scan without points, with the path up to this scan and the run number 0;
@@ -181,6 +191,11 @@ class FrameStore:
         if self._other_trees is not None and index < self._with_other_trees:
             frame, confirmed_s = self._other_trees.in_frame(frame, scan.shown.time_s)
         return msgspec.structs.replace(scan.shown, frame=frame, confirmed_s=confirmed_s)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the file [bytes]."""
+        return self._blocks.nbytes
 
     def forget_from(self, index: int) -> None:
         """Remove the results of the scan with this index and of later ones."""
@@ -229,6 +244,7 @@ class RunMap:
         mapper: A mapper before its first scan.
         parameters: Parameters from the first scan onwards.
         start_ns: Returns the time of the first scan [ns].
+        budget: What it may keep.
         is_live: Whether the run cannot go back; then neither states nor frames are stored.
 
     Attributes:
@@ -250,12 +266,13 @@ class RunMap:
         mapper: Mapper,
         parameters: Parameters,
         start_ns: Callable[[], int],
+        budget: RunBudget,
         *,
         is_live: bool = False,
     ) -> None:
         self.mapper = mapper
-        self.frames = None if is_live else FrameStore()
-        mapper.log = None if is_live else TreeLog()
+        self.frames = None if is_live else FrameStore(budget.results)
+        mapper.log = None if is_live else TreeLog(budget.tree_log)
         self.parameters = ParameterHistory(parameters)
         self.before = mapper.snapshot()
         self.snapshots = Snapshots(self.before, 0 if is_live else _MOST_STATES)
@@ -371,6 +388,16 @@ class RunMap:
         self.mapper.parameters = parameters
         self.mapper.restore(self.before)
         return True
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the file of the frames [bytes]."""
+        return 0 if self.frames is None else self.frames.nbytes
+
+    @property
+    def log_bytes(self) -> int:
+        """Memory of what the trees are made of [bytes]."""
+        return 0 if self.mapper.log is None else self.mapper.log.nbytes
 
     def close(self) -> None:
         """Delete the stored states and frames."""

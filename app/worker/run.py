@@ -13,6 +13,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from app.common.settings import RunBudget, RunStorage
 from app.common.timers import TOTAL, Stopwatch
 from app.explain.records import History
 from app.robot.source import LiveSource
@@ -81,6 +82,7 @@ class Run:
         request: SourceRequest,
         parameters: Parameters,
         make_mapper: MakeMapper,
+        budget: RunBudget,
     ) -> None:
         moving, chosen = with_odometry(source, request.odometry)
         live, left_out = source if isinstance(source, LiveSource) else None, Counter[str]()
@@ -105,12 +107,13 @@ class Run:
         def mapper(values: Parameters) -> Mapper:
             return make_mapper(moving.description, values, request.seed, self.stopwatch)
 
-        self._make_mapper = mapper
+        self._make_mapper, self._budget = mapper, budget
         self._map = self._new_map(self._make_mapper(parameters))
-        self._cursor = Cursor(read, source.description.uri, None if self._is_live else StepStore())
+        self._steps = None if self._is_live else StepStore(budget.scans)
+        self._cursor = Cursor(read, source.description.uri, self._steps)
         self._step: Step | None = None
         self._broken = False
-        self._caches = ScanCaches()
+        self._caches = ScanCaches(budget.segmented)
         self._cache = self._caches.of(parameters)
         self._numbers = TreeNumbers()
         self._views_sent = 0
@@ -120,7 +123,7 @@ class Run:
 
     def _new_map(self, mapper: Mapper) -> RunMap:
         """Return an empty map of a mapper before its first scan."""
-        return RunMap(mapper, mapper.parameters, lambda: self.start_ns, is_live=self._is_live)
+        return RunMap(mapper, mapper.parameters, lambda: self.start_ns, self._budget, is_live=self._is_live)
 
     def history(self, number: int, scan: int) -> History:
         """Return the estimates of the tree `number` up to the scan `scan`, see `TreeHistory.of`; empty for an
@@ -539,6 +542,17 @@ class Run:
         self._cursor.go_to(scans)
         self._map.mapper.restore(state)
         self.current, self._step, self._broken = scans - 1, None, False
+
+    @property
+    def storage(self) -> RunStorage:
+        """What the run keeps at present."""
+        maps = [known for known in (self._map, self._previous) if known is not None]
+        scans = 0 if self._steps is None else self._steps.nbytes
+        return RunStorage(
+            scans + self._caches.nbytes + sum(known.file_bytes for known in maps),
+            sum(known.log_bytes for known in maps),
+            self._budget,
+        )
 
     def use(self, parameters: Parameters, index: int) -> bool:
         """Use other parameters from the scan with an index onwards; return whether any value changes. No scan

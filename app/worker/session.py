@@ -15,6 +15,7 @@ import numpy as np
 
 from app.batch.summary import driven, health_word, scans_left_out
 from app.batch.tree_pictures import best_views
+from app.common.settings import DEFAULT_BUDGET, RunBudget
 from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
@@ -59,6 +60,7 @@ class Session:
         compiling: Compiles the kernels that are not compiled on this machine yet, in other processes; yields
             whether those of the front end are there until all are.
         warm_up: Loads the kernels; called while a robot is already received and recorded.
+        budget: What a run may keep.
 
     Attributes:
         on_preview: Called by `remap` with the revision of the parameters and the preview trees of a rerun,
@@ -74,9 +76,10 @@ class Session:
         parameters: Parameters,
         compiling: Callable[[], Iterator[bool]] = lambda: iter(()),
         warm_up: Callable[[], None] = lambda: None,
+        budget: RunBudget = DEFAULT_BUDGET,
     ) -> None:
         self._open_source = open_source
-        self._warm_up = warm_up
+        self._warm_up, self._budget = warm_up, budget
         self._compile, self._compiling, self._is_segmenting = compiling, compiling(), False
         self.unmapped = 0
         self._make_mapper = make_mapper
@@ -177,7 +180,7 @@ class Session:
             if isinstance(source, OneStepSource):
                 run = OneStepRun(source, self._parameters)
             else:
-                run = Run(source, request, self._parameters, self._make_mapper)
+                run = Run(source, request, self._parameters, self._make_mapper, self._budget)
         except BaseException:
             source.close()
             raise
@@ -532,6 +535,7 @@ def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | Non
         warnings=[*status.warnings, *losses, *([run.cache_notice] if run.cache_notice else [])],
         camera=has_camera(description),
         remapped=run.remapped,
+        storage=run.storage if isinstance(run, Run) else None,
     )
 
 

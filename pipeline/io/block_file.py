@@ -27,11 +27,13 @@ LARGE = _DISK if _DISK.is_dir() else None
 
 
 class _File:
-    """An open file without a name, its length, and the number of the indices that have blocks in it."""
+    """An open file without a name, the number of the indices that have blocks in it, and its positions: those
+    of a file that drops its oldest blocks go on beyond its size, and begin again in the file itself."""
 
     def __init__(self, handle: Any) -> None:  # noqa: ANN401 - its class depends on the operating system
         self.handle = handle
-        self.end, self.users = 0, 1
+        self.users = 1
+        self.end = self.kept_from = 0  # position after the last block; that of the oldest intact byte
         weakref.finalize(self, handle.close)
 
 
@@ -41,18 +43,19 @@ class BlockFile:
 
     Args:
         most: Maximum size of the file [bytes]. A block that does not fit is not stored.
+        drops_oldest: Whether a block that does not fit takes the place of those that were stored first.
 
     Attributes:
-        refusal: Reason why some blocks are not stored, for people; "" if all are stored.
+        refusal: Reason why some blocks are not stored, for people; "" if all are stored, or were.
         refused: Number of the first block that was not stored; later ones may be smaller and be stored.
         notice: Message for people that stored blocks could not be read; "" if all could be read.
     """
 
-    def __init__(self, most: int = MOST_BYTES) -> None:
+    def __init__(self, most: int = MOST_BYTES, *, drops_oldest: bool = False) -> None:
         """Create the file; an error of the disk appears in `refusal`."""
         handle = _unnamed_file()
         self._file = None if handle is None else _File(handle)
-        self._most = most
+        self._most, self._drops_oldest = most, drops_oldest
         # Begin (-1: not stored) and length of each block by its number: 12 bytes.
         self._begins, self._lengths = array("q"), array("I")
         self.refusal = self.notice = ""
@@ -71,20 +74,30 @@ class BlockFile:
 
     def __len__(self) -> int:
         """Return the number of stored blocks."""
-        return len(self._begins) - self._begins.count(-1)
+        return sum(begin >= self._kept_from for begin in self._begins)
 
     def __contains__(self, index: int) -> bool:
         """Return whether a block with this number is stored."""
-        return 0 <= index < len(self._begins) and self._begins[index] >= 0
+        return 0 <= index < len(self._begins) and self._begins[index] >= self._kept_from
 
     @property
     def nbytes(self) -> int:
         """Size of the file [bytes]."""
-        return 0 if self._file is None else self._file.end
+        return 0 if self._file is None else min(self._file.end, self._most)
+
+    @property
+    def _kept_from(self) -> int:
+        """Position of the oldest byte that no later block took the place of."""
+        return 0 if self._file is None else self._file.kept_from
 
     def has_all(self, blocks: int) -> bool:
         """Return whether the blocks 0 to `blocks` - 1 are all stored."""
-        return len(self._begins) >= blocks and -1 not in self._begins[:blocks]
+        return len(self._begins) >= blocks and min(self._begins[:blocks], default=0) >= self._kept_from
+
+    def is_new(self, index: int) -> bool:
+        """Return whether a block is stored, and half the file or more can be written before it is dropped."""
+        half = 0 if self._file is None or not self._drops_oldest else self._file.end - self._most // 2
+        return index in self and self._begins[index] >= half
 
     def put_block(self, index: int, content: bytes) -> bool:
         """Store a block at the end of the file, unless its number is stored already or the file is closed. If
@@ -102,14 +115,16 @@ class BlockFile:
             self._refuse(index, f"its data takes more than {LARGEST >> 20} MB")
             return False
         block = zstandard.ZstdCompressor(_LEVEL, write_checksum=True).compress(content)
+        begin = self._place(file.end, len(block))
         try:
-            if file.end + len(block) > self._most:
+            if begin is None:
                 self._refuse(index, f"the limit of {self._most / 1e9:.1f} GB is reached")
                 return False
             if index % BLOCKS_BETWEEN_CHECKS == 0 and free_space(LARGE) < SPARE_BYTES + len(block):
                 self._refuse(index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
                 return False
-            file.handle.seek(file.end)
+            file.kept_from = max(file.kept_from, begin + len(block) - self._most)
+            file.handle.seek(begin % self._most)
             view = memoryview(block)
             while view:
                 view = view[file.handle.write(view) or 0 :]
@@ -119,9 +134,18 @@ class BlockFile:
         missing = index + 1 - len(self._begins)
         self._begins.extend([-1] * missing)
         self._lengths.extend([0] * missing)
-        self._begins[index], self._lengths[index] = file.end, len(block)
-        file.end += len(block)
+        self._begins[index], self._lengths[index] = begin, len(block)
+        file.end = begin + len(block)
         return True
+
+    def _place(self, end: int, size: int) -> int | None:
+        """Return the position of a block of `size` bytes after the position `end`; None if it does not fit.
+        No block goes across the end of the file."""
+        if end + size <= self._most:
+            return end
+        if not self._drops_oldest or size > self._most:
+            return None
+        return end if end % self._most + size <= self._most else (end // self._most + 1) * self._most
 
     def read_block(self, index: int, unpack: Callable[[bytes], B]) -> B | None:
         """Return the result of `unpack` for the content of a block; None if the block is not stored or is
@@ -137,7 +161,7 @@ class BlockFile:
         if index not in self or self._file is None:
             return None
         try:
-            self._file.handle.seek(self._begins[index])
+            self._file.handle.seek(self._begins[index] % self._most)
             block = self._file.handle.read(self._lengths[index])
             if not 0 <= zstandard.frame_content_size(block) <= LARGEST:
                 raise ValueError("the size of the block is not valid")
@@ -152,7 +176,8 @@ class BlockFile:
         used again, unless the file is shared."""
         del self._begins[index:], self._lengths[index:]
         if self._file is not None and self._file.users == 1:
-            self._file.end = max((0, *map(sum, zip(self._begins, self._lengths, strict=True))))
+            ends = map(sum, zip(self._begins, self._lengths, strict=True))
+            self._file.end = max((self._file.kept_from, *ends))
 
     def close(self) -> None:
         """Close the file, which is deleted unless it is shared. Later calls store and return nothing."""

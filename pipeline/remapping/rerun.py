@@ -150,6 +150,11 @@ class ScanCaches:
         self._open.move_to_end(key)
         return self._open[key]
 
+    @property
+    def nbytes(self) -> int:
+        """Size of all files [bytes]."""
+        return sum(each.nbytes for each in self._open.values())
+
     def close(self) -> None:
         """Close all caches, which deletes their files; a later `of` opens empty ones."""
         for each in self._open.values():

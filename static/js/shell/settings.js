@@ -36,6 +36,15 @@ function startBox(id, isOn, act) {
   box.addEventListener("change", () => act(box.checked));
 }
 
+// What the run keeps to go back and to map again without its source.
+function showStorage() {
+  const kept = state.status?.storage;
+  byId("run-storage").hidden = !kept;
+  if (!kept) return;
+  const { files, memory, budget } = kept, gb = (bytes) => (bytes / 1e9).toFixed(1), mb = (bytes) => Math.round(bytes / 1e6);
+  byId("run-storage").textContent = `This run keeps ${gb(files)} of ${gb(budget[0])} GB in temporary files and ${mb(memory)} of ${mb(budget[1])} MB in memory, to go back and to map again. Beyond that, it reads its source (STEMMAP_RUN_GB, STEMMAP_RUN_MEMORY_MB).`;
+}
+
 export function startSettings() {
   const theme = byId("theme-choice");
   const showTheme = () => { theme.value = themeName(); };
@@ -54,6 +63,7 @@ export function startSettings() {
       if (wanted) give(); // so that a person knows it
     });
   }
+  on("status", showStorage);
   byId("alarm-vibration").parentElement.hidden = !navigator.vibrate;
   on("map", signal);
 }

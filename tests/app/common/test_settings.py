@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from app.common.settings import VARIABLES, Settings, from_environment, is_loopback
+from app.common.settings import VARIABLES, RunBudget, Settings, from_environment, is_loopback
 from pipeline.errors import StemmapError
 
 
@@ -25,6 +25,8 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         "STEMMAP_FOLDER": str(tmp_path / "kept"),
         "STEMMAP_FILES": "folders",
         "STEMMAP_UPLOAD_GB": "2.5",
+        "STEMMAP_RUN_GB": "0.5",
+        "STEMMAP_RUN_MEMORY_MB": "30",
     }
     of_extensions = {"STEMMAP_EXTENSIONS"}  # read by app.extension
     assert set(given) | of_extensions == set(VARIABLES)
@@ -37,6 +39,7 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         folder=tmp_path / "kept",
         upload_limit=2_500_000_000,
         files="folders",
+        run_budget=RunBudget(500_000_000, 30_000_000),
     )
 
 
@@ -63,6 +66,8 @@ def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str],
         ("STEMMAP_UPLOAD_GB", "much"),
         ("STEMMAP_UPLOAD_GB", "-1"),
         ("STEMMAP_UPLOAD_GB", "nan"),
+        ("STEMMAP_RUN_GB", "0"),
+        ("STEMMAP_RUN_MEMORY_MB", "much"),
         ("STEMMAP_TOKEN", "short"),
         ("STEMMAP_TOKEN", "with a\nline break in it"),
         ("STEMMAP_TOKEN", "öööööööööööööööööö"),

@@ -36,7 +36,7 @@ def test_going_back_gives_the_same_steps(stored, reads, monkeypatch):
     put = BlockFile.put_block
     monkeypatch.setattr(BlockFile, "put_block", lambda self, n, block: n < stored and put(self, n, block))
     recording = Recording()
-    with closing(Cursor(recording.read, "a recording", StepStore())) as cursor:
+    with closing(Cursor(recording.read, "a recording", StepStore(1 << 30))) as cursor:
         whole = taken(cursor)
         assert len(whole) > 30
         for index in (30, 25, 14, 37):

@@ -32,7 +32,7 @@ def test_each_scan_has_the_path_of_its_time(moves: list[tuple[bool, int]]) -> No
     """A scan with True replaces the path from a row onwards; False goes back to that scan."""
     xs: list[float] = []
     known: list[list[float]] = []
-    with closing(FrameStore()) as store:
+    with closing(FrameStore(1 << 30)) as store:
         for number, (is_correction, row) in enumerate(moves):
             if is_correction:
                 xs = [x if k < row else x + 1.0 for k, x in enumerate(xs)]
@@ -47,7 +47,7 @@ def test_each_scan_has_the_path_of_its_time(moves: list[tuple[bool, int]]) -> No
 
 
 def test_corrections_of_a_long_path_take_no_memory() -> None:
-    with closing(FrameStore()) as store:
+    with closing(FrameStore(1 << 30)) as store:
         xs = np.zeros(20_000).tolist()
         store._scans = len(xs) - 60
         store._path = fakes.path(xs[:-60])
@@ -63,7 +63,7 @@ def test_corrections_of_a_long_path_take_no_memory() -> None:
 def test_what_the_file_refuses_ends_the_store_and_harms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     put_block = BlockFile.put_block
     monkeypatch.setattr(BlockFile, "put_block", lambda self, n, block: n < 5 and put_block(self, n, block))
-    with closing(FrameStore()) as store:
+    with closing(FrameStore(1 << 30)) as store:
         known: list[list[float]] = []
         for k in range(8):
             known.append([float(k >= 5) + 0.1 * row for row in range(k + 1)])
@@ -76,7 +76,7 @@ def test_what_the_file_refuses_ends_the_store_and_harms_nothing(monkeypatch: pyt
 
 def test_after_a_scan_that_is_too_large_the_others_have_their_ground(monkeypatch: pytest.MonkeyPatch) -> None:
     ground = no_height_map()
-    with closing(FrameStore()) as store:
+    with closing(FrameStore(1 << 30)) as store:
         for index in range(3):
             frame = replace(fakes.frame(index, fakes.START_NS + index), ground=ground)
             with monkeypatch.context() as limited:
@@ -88,3 +88,20 @@ def test_after_a_scan_that_is_too_large_the_others_have_their_ground(monkeypatch
             shown = store.read(index)
             assert shown is not None
             assert shown.frame.ground is not None
+
+
+def test_the_last_scans_stay_when_the_file_is_full() -> None:
+    """Also while the ground does not change for long: it is stored again before its first scan is dropped."""
+    ground = no_height_map()
+    scans, most = 400, 300_000
+    with closing(FrameStore(most)) as store:
+        for index in range(scans):
+            frame = replace(fakes.frame(index, fakes.START_NS + index), ground=ground)
+            store.put(frame, fakes.path([0.0] * (index + 1)), 0.1 * index, np.zeros(0))
+        assert store.nbytes <= most
+        assert store.read(0) is None
+        for back in range(1, 21):
+            shown = store.read(scans - back)
+            assert shown is not None
+            assert shown.frame.ground is not None
+            assert shown.path.x.shape == (scans - back + 1,)

@@ -49,3 +49,45 @@ def test_the_space_of_forgotten_blocks_is_used_again_once_the_file_is_not_shared
         other.close()
         file.forget_from(1)
         assert file.nbytes == size // 2
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(["put", "put", "put", "forget", "copy"]), st.integers(0, 11)), max_size=60
+    )
+)
+def test_a_full_file_drops_the_blocks_that_were_stored_first(moves: list[tuple[str, int]]) -> None:
+    """What is read is what was stored; what is dropped was stored before all that stays; and at least half of
+    the file is in use once it was full."""
+    most, rng = 4000, np.random.default_rng(0)
+    with closing(BlockFile(most, drops_oldest=True)) as file:
+        stored: dict[int, bytes] = {}  # in the order in which they were stored
+        for name, number in moves:
+            if name == "put" and number not in file:
+                stored.pop(number, None)
+                stored[number] = rng.bytes(50 + 100 * number)
+                assert file.put_block(number, stored[number])
+            elif name == "forget":
+                file.forget_from(number)
+                stored = {n: content for n, content in stored.items() if n < number}
+            elif name == "copy":
+                file.copy().close()
+            kept = [n in file for n in stored]
+            assert kept == sorted(kept), "the oldest ones are dropped first"
+            assert len(file) == sum(kept)
+            assert file.nbytes <= most
+            for n, content in stored.items():
+                assert file.read_block(n, bytes) == (content if n in file else None)
+            newest = list(stored.values())[::-1]
+            used = np.cumsum([len(content) + 20 for content in newest])
+            assert all(n in file for n, size in zip(list(stored)[::-1], used, strict=True) if size < most / 4)
+        assert not file.refusal
+
+
+def test_a_block_larger_than_the_file_is_refused_and_drops_nothing() -> None:
+    with closing(BlockFile(1000, drops_oldest=True)) as file:
+        rng = np.random.default_rng(0)
+        assert file.put_block(0, rng.bytes(500))
+        assert not file.put_block(1, rng.bytes(2000))
+        assert 0 in file
+        assert "limit" in file.refusal

@@ -121,15 +121,15 @@ def test_scans_that_are_not_known_are_told():
             log.at(index)
 
 
-def test_a_log_that_grows_too_large_is_empty(monkeypatch):
+def test_a_log_that_grows_too_large_is_empty():
     known = MappedRun(FOREST).mapper.log
     assert known is not None
     assert known.has_all(SCANS)
-    monkeypatch.setattr("pipeline.tree_log.MOST_BYTES", 100_000)
-    log = TreeLog()
+    log = TreeLog(100_000)
     for k in range(SCANS):
         log.put(k, known.at(k))
     assert not log.has_all(1)
+    assert log.nbytes == 0
 
 
 def test_only_parameters_of_the_trees_may_differ():
