@@ -77,12 +77,14 @@ class RunBudget(NamedTuple):
 DEFAULT_BUDGET = RunBudget()
 
 
-class RunStorage(NamedTuple):
-    """What a run keeps at present [bytes], and its budget."""
+@dataclass(frozen=True, slots=True)
+class RunStorage:
+    """What a run keeps at present, in files and in memory, and at most [bytes]; see `RunBudget`."""
 
     files: int
     memory: int
-    budget: RunBudget
+    most_files: int
+    most_memory: int
 
 
 @dataclass(frozen=True, slots=True)

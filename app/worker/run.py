@@ -551,7 +551,8 @@ class Run:
         return RunStorage(
             scans + self._caches.nbytes + sum(known.file_bytes for known in maps),
             sum(known.log_bytes for known in maps),
-            self._budget,
+            self._budget.files,
+            self._budget.memory,
         )
 
     def use(self, parameters: Parameters, index: int) -> bool:

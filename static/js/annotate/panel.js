@@ -203,7 +203,7 @@ const CLASS_KEYS = { P: "pole", H: "person", B: "bush", O: "other" }; // with Sh
 const ARROWS = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP] };
 
 export const ANNOTATE_KEYS = [
-  ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["shift+p shift+h shift+b shift+o", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
+  ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["shift P H B O", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
   ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "undo and redo an edit"], ["shift+click", "in the 3D scene: add a tree there"],
 ];
 

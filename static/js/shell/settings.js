@@ -41,8 +41,8 @@ function showStorage() {
   const kept = state.status?.storage;
   byId("run-storage").hidden = !kept;
   if (!kept) return;
-  const { files, memory, budget } = kept, gb = (bytes) => (bytes / 1e9).toFixed(1), mb = (bytes) => Math.round(bytes / 1e6);
-  byId("run-storage").textContent = `This run keeps ${gb(files)} of ${gb(budget[0])} GB in temporary files and ${mb(memory)} of ${mb(budget[1])} MB in memory, to go back and to map again. Beyond that, it reads its source (STEMMAP_RUN_GB, STEMMAP_RUN_MEMORY_MB).`;
+  const gb = (bytes) => (bytes / 1e9).toFixed(1), mb = (bytes) => Math.round(bytes / 1e6);
+  byId("run-storage").textContent = `This run keeps ${gb(kept.files)} of ${gb(kept.most_files)} GB in temporary files and ${mb(kept.memory)} of ${mb(kept.most_memory)} MB in memory, to go back and to map again. Beyond that, it reads its source (STEMMAP_RUN_GB, STEMMAP_RUN_MEMORY_MB).`;
 }
 
 export function startSettings() {
