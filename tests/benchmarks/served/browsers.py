@@ -75,6 +75,8 @@ class Browsers:
             base_url=f"http://127.0.0.1:{port}",
             headers={"Authorization": f"Bearer {token}"},
             timeout=_LONGEST_S,
+            # A connection that stays open may be closed by the server while the next request is on its way.
+            limits=httpx.Limits(max_keepalive_connections=0),
         )
 
     async def answer(self, question: dict[str, Any]) -> dict[str, Any]:
