@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int | None:
         )
     from app.batch.run_folder import check_folder, partial_output_warnings
     from app.cli.map import print_result
-    from app.extensions.clouds.inventory import SECTION, SLICE
+    from app.extensions.clouds.inventory import NO_TREE, SECTION, SLICE, TWICE, UNIT_DOUBT
     from app.extensions.clouds.result_files import map_plot_run
     from pipeline.io.ground_truth import read_truth_trees
     from pipeline.io.readers.cloud_frame import TOO_COARSE
@@ -58,5 +58,5 @@ def run(arguments: argparse.Namespace) -> int | None:
         outcome.warnings,
         outcome.losses,
         replaces=replaces,
-        wrong=(SECTION, SLICE, UP_UNCLEAR, TOO_COARSE),
+        wrong=(SECTION, SLICE, UP_UNCLEAR, TOO_COARSE, UNIT_DOUBT, TWICE, NO_TREE),
     )

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.extensions.clouds.terrain_raster import LowestReturns, TerrainRaster, heights_above
+from app.extensions.clouds.terrain_raster import LowestReturns, NoiseBelow, TerrainRaster, heights_above
 from app.extensions.clouds.thinning import Thinned
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
 from pipeline.types.records import Float32, WholeCloud
 
-MOST_RASTER = 96 << 20  # bytes
+MOST_RASTER = 128 << 20  # bytes
 SQUARE = 8.0  # m
 LEAST = 20  # points of a square that belongs to the plot with its neighbours
 MOST_SQUARES = 1 << 20
@@ -111,7 +111,7 @@ def ground_steps(
     cloud that is done, up to 0.35, after each part.
 
     Args:
-        cloud: The cloud, which is read three times.
+        cloud: The cloud, which is read three times, or four times if it has noise below the ground.
         slope_max: Largest slope of the terrain against the plane of the plot [degrees].
         band: Lowest and highest height above the ground that is kept, both exclusive [m].
         most: Maximum number of points after thinning, a power of two.
@@ -141,10 +141,16 @@ def ground_steps(
             remedy="Cut it into plots of at most 400 x 400 m; if its coordinates are no metres, name their "
             "unit with --unit",
         )
-    lowest = LowestReturns(extent.low, extent.high)
+    lowest, noise = LowestReturns(extent.low, extent.high), NoiseBelow(extent.low, extent.high)
     for part in cloud.parts():
         lowest.add(part)
+        noise.add(part)
         yield 0.2
+    if (floor := noise.floor()) is not None:
+        lowest = LowestReturns(extent.low, extent.high)
+        for part in cloud.parts():
+            lowest.add(part[noise.is_above(part, floor)])
+            yield 0.25
     ground = lowest.ground(float(np.radians(slope_max)))
     del lowest
     near, below = Thinned(most), 0

@@ -18,6 +18,7 @@ from pipeline.ground.scan_ground import TOLERANCE
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int, Int32
 
+UInt16 = NDArray[np.uint16]
 UInt64 = NDArray[np.uint64]
 
 CELL = 0.5  # m
@@ -25,6 +26,13 @@ KEPT = 8  # lowest returns of a cell
 TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
 PIT = 0.5  # m; a cell this far below its neighbours is noise
 AT_ONCE = 1_000_000  # points whose heights are computed at once, to bound the memory
+#: Side of a column and height of its bins [m], and number of bins, by whose counts noise below the ground is
+#: told from it; higher points count in the bins of those 64 m below.
+COLUMN, BIN, BINS = 2.0, 0.25, 256
+#: Share of the points of a column that is more than noise in one bin (one per cent of noise is in several),
+#: depth below this bin in which nothing but noise is, least depth of that on average [m], and least share of
+#: the bins there that noise occupies. Of real plots, the depth is 0 to 0.5 m, and 3 m and more with noise.
+DENSE, CLEARLY_BELOW, DEEP, OCCUPIED = 0.005, 1.0, 1.25, 0.05
 BLOCK = 32  # columns of the raster whose neighbours are sorted at once, likewise
 
 
@@ -90,6 +98,63 @@ class TerrainRaster:
         return nearest
 
 
+class NoiseBelow:
+    """Finds the level below which the points of a plot are noise, such as reflections of wet ground.
+
+    The lowest returns of a cell tell a few of them from the ground (see `LowestReturns`), but not as many as
+    one per cent of the points of a dense cloud. They are spread over the heights, while the ground is in few
+    bins.
+
+    Args:
+        low, high: Corners of the plot, shape (2,) [m]; points outside are ignored.
+    """
+
+    def __init__(self, low: Float, high: Float) -> None:
+        shape = np.maximum(np.ceil((high - low) / COLUMN).astype(np.int64), 1)
+        self._low = low.astype(np.float64)
+        self._count = np.zeros((shape[0], shape[1], BINS), np.uint16)
+        self._lowest = np.full((shape[0], shape[1]), np.inf)
+
+    def add(self, points: Float32) -> None:
+        """Add points of shape (N, 3) [m], finite."""
+        _count_bins(points, self._low, self._count, self._lowest)
+
+    def floor(self) -> Float | None:
+        """Return the level of each column below which points are noise, shape (columns, rows) [m], inf for a
+        column without others; None if there is hardly any noise, as in most plots.
+
+        Noise is in the bins CLEARLY_BELOW the lowest bin with DENSE of the points of its column. Its mean is
+        known by the share of these bins that is occupied (Poisson); if they have more points, they are no
+        noise. The level is the lowest bin with 5 standard deviations and 3 points more.
+        """
+        known = np.isfinite(self._lowest)
+        first = np.floor(self._lowest[known] / BIN).astype(np.int64)
+        bins = (first[:, None] + np.arange(BINS)) % BINS
+        n = np.take_along_axis(self._count[known], bins, axis=1).astype(np.float64)
+        dense = (n >= DENSE * n.sum(axis=1, keepdims=True)).argmax(axis=1)
+        # The lowest bin of a column has a point by its choice.
+        is_below = (np.arange(BINS) >= 1) & (np.arange(BINS) < dense[:, None] - round(CLEARLY_BELOW / BIN))
+        below = n[is_below]
+        is_shallow = len(below) * BIN < DEEP * len(n) or not len(n)
+        if is_shallow or (share := float((below > 0.0).mean())) < OCCUPIED:
+            return None
+        noise = max(-np.log(max(1.0 - share, 0.01)), float(np.median(below)))  # nearly all may be occupied
+        most = noise + 5.0 * np.sqrt(noise) + 3.0
+        if np.percentile(below[below > 0.0], 80) > most:  # stems below crowns, whose ground is hardly seen
+            return None
+        is_more = n >= most
+        floor = np.full(known.shape, np.inf)
+        floor[known] = np.where(is_more.any(axis=1), (first + is_more.argmax(axis=1)) * BIN, np.inf)
+        return floor
+
+    def is_above(self, points: Float32, floor: Float) -> Bool:
+        """Return whether points of shape (N, 3) [m] are above the floor of their column, shape (N,)."""
+        place = np.floor((points[:, :2] - self._low) / COLUMN).astype(np.int64)
+        column = np.clip(place, 0, np.array(floor.shape) - 1)
+        above: Bool = points[:, 2] >= floor[column[:, 0], column[:, 1]]
+        return above
+
+
 class LowestReturns:
     """Collects the lowest returns of each cell.
 
@@ -106,10 +171,10 @@ class LowestReturns:
 
     @staticmethod
     def room(low: Float, high: Float) -> int:
-        """Return the memory that a raster between two corners, shape (2,) [m], needs [bytes], before it is
-        taken."""
+        """Return the memory that a raster between two corners, shape (2,) [m], needs with the columns of
+        `NoiseBelow` [bytes], before it is taken."""
         columns, rows = (max(int(np.ceil(v / CELL)), 1) for v in (high - low).tolist())
-        return columns * rows * (12 * KEPT + 4 + 8)
+        return columns * rows * (12 * KEPT + 4 + 8) + int(columns * rows * (CELL / COLUMN) ** 2) * 2 * BINS
 
     def add(self, points: Float32) -> None:
         """Add points of shape (N, 3) [m], finite; points outside of the raster are ignored."""
@@ -146,6 +211,29 @@ def heights_above(points: Float32, ground: TerrainRaster) -> Float32:
         x, y, z = points[first : first + AT_ONCE].T.astype(np.float64)
         above[first : first + AT_ONCE] = z - ground.at(x, y)
     return above
+
+
+@compiled
+def _count_bins(points: Float32, low: Float, count: UInt16, lowest: Float) -> None:
+    """Add points to the tables of `NoiseBelow`, in place; points outside are ignored.
+
+    Args:
+        points: Points, float32, shape (N, 3) [m].
+        low: Corner of the columns, shape (2,) [m].
+        count: Number of points of each bin, at most 65535, shape (columns, rows, BINS).
+        lowest: Lowest point of each column, shape (columns, rows) [m].
+    """
+    columns, rows = lowest.shape
+    for i in range(points.shape[0]):
+        a = int(np.floor((points[i, 0] - low[0]) / COLUMN))
+        b = int(np.floor((points[i, 1] - low[1]) / COLUMN))
+        if not (0 <= a < columns and 0 <= b < rows):
+            continue
+        z = float(points[i, 2])
+        lowest[a, b] = min(lowest[a, b], z)
+        bin_ = int(np.floor(z / BIN)) % BINS
+        if count[a, b, bin_] < 65535:
+            count[a, b, bin_] += 1
 
 
 @compiled

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from datetime import datetime
 from itertools import islice, takewhile
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 
@@ -33,16 +33,43 @@ class TextError(Exception):
     """A text file does not have the expected contents; the message gives the reason."""
 
 
+class PoseRows(NamedTuple):
+    """Rows of a file of poses.
+
+    Attributes:
+        times: Times of the rows [ns], int64, shape (N,); None without times.
+        frames: Numbers of the scans to which the rows belong, int64, shape (N,); None without numbers.
+        poses: Poses of the LiDAR (x forward), N.
+    """
+
+    times: Int | None
+    frames: Int | None
+    poses: list[Pose3]
+
+
 def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
-    """Return times and poses of the LiDAR (x forward) from a file: TUM rows t x y z qx qy qz qw or rows of a
-    time and a 3 x 4 matrix with times [ns], int64, shape (N,), or KITTI rows of a matrix (times None).
+    """Return times and poses of a file, see `read_pose_rows`; TextError also if its rows have numbers of
+    frames, which belong to the names of scan files."""
+    times, frames, poses = read_pose_rows(path)
+    if frames is not None:
+        raise TextError(
+            "its rows begin with numbers of frames in place of times; as poses.txt in the folder of the scan "
+            "files it is read"
+        )
+    return times, poses
+
+
+def read_pose_rows(path: Path) -> PoseRows:
+    """Return the poses of the LiDAR (x forward) in a file: TUM rows t x y z qx qy qz qw or rows of a time and
+    a 3 x 4 matrix with times, KITTI rows of a matrix, or KITTI-360 rows of a number of a frame and a matrix.
 
     Blanks, commas or semicolons separate the numbers. The names in a first line, such as
     `#sec,nsec,x,y,z,qx,qy,qz,qw`, tell the columns of a time and a TUM pose; names that do not tell them are
     refused. Without names, the number of columns tells them. KITTI writes the poses of its left camera (x
     right, y down, z forward); others write those of the LiDAR. If a file `calib.txt` with a valid row `Tr:`
     is in the same folder, they are KITTI poses. Otherwise the motion decides: a robot moves along z of a
-    camera or along x of a LiDAR.
+    camera or along x of a LiDAR. KITTI-360 writes the poses of its IMU (x forward, y right, z down) in a
+    world with z up; its calibration is read from the folder `calibration` beside that of the drives.
 
     Raises:
         TextError: The file has neither format, names that do not tell the columns, times that do not strictly
@@ -62,23 +89,28 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
     if any(len(line) != columns for line in lines):
         raise TextError(f"its rows do not have {columns} numbers")
     time, pose = found
-    if time and len(pose) == KITTI_COLUMNS and all(_FRAME.fullmatch(line[0]) for line in lines):
-        raise TextError("its rows begin with numbers of frames in place of times")
     rows = _table([[line[k] for k in pose] for line in lines], len(pose))
     times = _times([[line[k] for k in time] for line in lines]) if time else None
     if times is not None and np.any(np.diff(times) <= 0):
         raise TextError("its times do not ascend")
     if len(pose) == KITTI_COLUMNS:
+        matrices = rows.reshape(-1, 3, 4)
+        if times is not None and all(_FRAME.fullmatch(line[time[0]]) for line in lines):
+            frames = times // 1_000_000_000
+            is_imu = bool(np.median(matrices[:, 2, 2]) < 0.0)  # a LiDAR has z up
+            T_imu_lidar = _calibration_of_imu(path) if is_imu else None
+            return PoseRows(None, frames, _poses_of_matrices(matrices, T_imu_lidar))
         T_camera_lidar = None if time else _calibration(path.with_name("calib.txt"))
-        return times, _poses_of_matrices(rows.reshape(-1, 3, 4), T_camera_lidar)
+        return PoseRows(times, None, _poses_of_matrices(matrices, T_camera_lidar))
     _check_positions(rows[:, :3])
     if np.any(np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) > _UNIT_LENGTH):
         raise TextError("it has quaternions whose length is not 1")
-    return times, [Pose3.from_quaternion(row[:3], row[[6, 3, 4, 5]]) for row in rows]
+    poses = [Pose3.from_quaternion(row[:3], row[[6, 3, 4, 5]]) for row in rows]
+    return PoseRows(times, None, poses)
 
 
 def _poses_of_matrices(rows: Float, T_camera_lidar: Pose3 | None) -> list[Pose3]:
-    """Return poses of the LiDAR from matrices, shape (N, 3, 4), see `read_any_poses`.
+    """Return poses of the LiDAR from matrices, shape (N, 3, 4), see `read_pose_rows`.
 
     Args:
         rows: The matrices.
@@ -314,11 +346,30 @@ def _calibration(path: Path) -> Pose3 | None:
     """Return `T_camera_lidar` of the calib.txt of KITTI; None if there is none or it cannot be used."""
     try:
         rows = [line.split() for line in _text(path).split("\n") if line.startswith("Tr:")]
-        matrix = np.array([float(word) for word in rows[0][1:]]).reshape(3, 4)
+        return _pose_of_numbers(rows[0][1:])
     except (OSError, TextError, ValueError, IndexError):
         return None
-    sound = np.isfinite(matrix).all() and _are_rotations(matrix[:, :3])
-    return Pose3(_nearest_rotation(matrix[:, :3]), matrix[:, 3]) if sound else None
+
+
+def _calibration_of_imu(path: Path) -> Pose3:
+    """Return `T_imu_lidar` of the calibration of KITTI-360 for `data_poses/<drive>/<path>`; that of an IMU at
+    the place of the LiDAR if it cannot be read."""
+    folder = path.absolute().parents[:3][-1] / "calibration"
+    try:
+        words = _text(folder / "calib_cam_to_pose.txt").partition("image_00:")[2].split()[:12]
+        T_imu_camera = _pose_of_numbers(words)
+        T_lidar_camera = _pose_of_numbers(_text(folder / "calib_cam_to_velo.txt").split())
+        return T_imu_camera @ T_lidar_camera.inverse()
+    except (OSError, TextError, ValueError):
+        return Pose3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+
+
+def _pose_of_numbers(words: list[str]) -> Pose3:
+    """Return the pose of the 12 numbers of a 3 x 4 matrix; ValueError if they are none."""
+    matrix = np.array([float(word) for word in words]).reshape(3, 4)
+    if not (np.isfinite(matrix).all() and _are_rotations(matrix[:, :3])):
+        raise ValueError("no pose")
+    return Pose3(_nearest_rotation(matrix[:, :3]), matrix[:, 3])
 
 
 def _moves_along_z(R: Float, t: Float) -> bool:

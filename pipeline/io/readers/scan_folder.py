@@ -22,7 +22,7 @@ from pipeline.io.readers.firing_order import FIRING_ORDER
 from pipeline.io.readers.mounting import assumed_mounting
 from pipeline.io.readers.point_files import Columns, ScanFileError, open_rows, open_table, read_columns
 from pipeline.io.readers.point_times import PointTimes, decide_point_times
-from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns, time_ns
+from pipeline.io.readers.pose_files import TextError, pose_at, read_pose_rows, read_times, seconds_ns, time_ns
 from pipeline.io.readers.scan_columns import (
     FARTHEST_MEDIAN,
     NO_METRES,
@@ -46,6 +46,8 @@ _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[
 _TRIES = 20
 #: Points of a tile of a cloud; the form of files with fewer points is not clear.
 _TILE = 20_000
+#: Share of a step by which two odometries of the same motion differ: a systematic error of wheels is less.
+_STEP_SHARE = 0.1
 #: Distance of a sensor from the origin by which the frame of its points is known [m].
 _DECISIVE = 1.0
 
@@ -60,14 +62,15 @@ Fit = tuple[list[Pose3 | None], Int | None]
 class ScanFolder(FileSource):
     """Source of scans from files, in the order of the numbers in their names.
 
-    Poses (odometry; `poses.txt` and the other names of POSES, see `read_any_poses`) and `times.txt` or
+    Poses (odometry; `poses.txt` and the other names of POSES, see `read_pose_rows`) and `times.txt` or
     `timestamps.txt` are read from the folder or its parent. The number in the name of a scan file is its row
     in them, or its index in the folder when there are as many rows as files; if neither fits, a warning is
     given and they are not used. Without such poses, those in the only text with a word like "odom" in its
     name are used whose times are those of the scans, or which has as many rows as there are scans; two
-    folders above, only times tell that they belong to this run. Without a file of times, the times are those
-    in the names of the scans (1645000000.25.pcd), else those of TUM rows. TUM rows are matched to scans by
-    time where both have times.
+    folders above, only times tell that they belong to this run. Rows with a number of a frame (KITTI-360,
+    also `data_poses/<drive>/poses.txt` beside the folder of the drives) belong to the scan with this number.
+    Without a file of times, the times are those in the names of the scans (1645000000.25.pcd), else those of
+    TUM rows. TUM rows are matched to scans by time where both have times.
 
     Args:
         uri: Path as the user wrote it.
@@ -100,6 +103,7 @@ class ScanFolder(FileSource):
         self._warnings: list[str] = []
         self._texts: list[Path] = []
         numbers = np.array([_number(file) for file in self._files], dtype=np.int64)
+        self._numbers = numbers
         by_time = _names_ns(self._files) is not None
         if by_time or len(np.unique(numbers)) < len(numbers) or (numbers < 0).any():
             numbers = np.arange(len(numbers), dtype=np.int64)
@@ -231,7 +235,8 @@ class ScanFolder(FileSource):
             places: The folder, its parent and the parent of this.
             numbers: Number in the name of each scan file.
         """
-        found = self._first_text(places[:2], POSES, lambda path: self._fitting(path, numbers))
+        drive = [p.parents[1] / "data_poses" / p.name for p in places[2:] if len(p.parents) > 1]  # KITTI-360
+        found = self._first_text([*places[:2], *drive], POSES, lambda path: self._fitting(path, numbers))
         if found is None:
             found = self._guessed(places)
         if found is None:
@@ -242,24 +247,27 @@ class ScanFolder(FileSource):
         return poses
 
     def _guessed(self, places: list[Path]) -> Fit | None:
-        """Return the poses of the only text that has a word of poses in its name and fits the scans (see
-        `_fitting`), with a warning that names it; None if there is none, or if there are several, with a
-        warning. Arguments as in `_read_poses`."""
+        """Return the poses of the text that has a word of poses in its name and fits the scans (see
+        `_fitting`), with a warning that names it; None if there is none. Of several with the same steps, that
+        with most poses is used; of others none, with a warning. Arguments as in `_read_poses`."""
         fits = list[tuple[Path, Fit]]()
         for place in places if self._timed else places[:2]:
             for path in _texts_of_poses(place):
                 with suppress(TextError, OSError):
                     fits.append((path, self._fitting(path, None, by_time=place in places[2:])))
-        names = named(sorted(path.name for path, _ in fits))
-        if len(fits) > 1:
-            self._warnings.append(
-                f"none of {names} is used: each may have the poses; choose one with --odometry file:"
-            )
-        if len(fits) != 1:
+        if not fits:
             return None
-        self._warnings.append(f"the motion is that in {names}, which was found by its name")
-        self._texts.append(fits[0][0])
-        return fits[0][1]
+        names = named(sorted(path.name for path, _ in fits))
+        if any(not _have_same_steps(fits[0][1][0], fit[0]) for _, fit in fits[1:]):
+            self._warnings.append(
+                f"none of {names} is used: each may have the poses, and they disagree; choose one with "
+                "--odometry file:"
+            )
+            return None
+        path, fit = max(fits, key=lambda found: sum(pose is not None for pose in found[1][0]))
+        self._warnings.append(f"the motion is that in {path.name}, which was found by its name")
+        self._texts.append(path)
+        return fit
 
     def _read_views(self) -> list[Pose3 | None] | None:
         """Return the pose of the sensor in the header of each PCD file; None if most files have none."""
@@ -349,10 +357,16 @@ class ScanFolder(FileSource):
             by_time: Whether only times tell that the rows belong to the scans.
 
         Raises:
-            TextError: The rows do not belong to the scans, or errors as those of `read_any_poses`.
+            TextError: The rows do not belong to the scans, or errors as those of `read_pose_rows`.
             OSError: The file cannot be read.
         """
-        times, rows = read_any_poses(path)
+        times, frames, rows = read_pose_rows(path)
+        if frames is not None:
+            row_of = dict(zip(frames.tolist(), rows, strict=True))
+            named_poses = [row_of.get(number) for number in self._numbers.tolist()]
+            if all(pose is None for pose in named_poses):
+                raise TextError("its frames are not those of the scans")
+            return named_poses, None
         if times is not None and self._timed:
             poses = [pose_at(times, rows, int(stamp_ns)) for stamp_ns in self._stamp]
             count = sum(pose is not None for pose in poses)
@@ -381,6 +395,19 @@ def _rows(count: int, numbers: Int) -> Int:
     if count == len(numbers):
         return np.arange(count, dtype=np.int64)
     raise TextError(f"it has {count} rows, the scans are numbered up to {int(numbers[-1])}")
+
+
+def _have_same_steps(first: list[Pose3 | None], second: list[Pose3 | None]) -> bool:
+    """Return whether two lists of the poses of the same scans, None for a scan without one, have the same
+    steps from scan to scan, up to _STEP_SHARE of the length and what a centimetre and 0.01 rad change."""
+    steps = [
+        (a0.inverse() @ a1, b0.inverse() @ b1)
+        for a0, a1, b0, b1 in zip(first, first[1:], second, second[1:], strict=False)
+        if a0 is not None and a1 is not None and b0 is not None and b1 is not None
+    ]
+    far = [np.linalg.norm(a.t - b.t) > 0.01 + _STEP_SHARE * np.linalg.norm(a.t) for a, b in steps]
+    turned = [np.abs(a.R - b.R).max() > 0.01 for a, b in steps]
+    return bool(steps) and float(np.mean(np.logical_or(far, turned))) < 0.5
 
 
 def _texts_of_poses(place: Path) -> list[Path]:

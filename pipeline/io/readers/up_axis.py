@@ -224,6 +224,27 @@ def _runs(place: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
     return length
 
 
+def _supported(z: Float, starts: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index of the lowest point of each cell that is no noise below the ground, shape (C,).
+
+    Two per cent of the points of a cell may be noise, and more of a cell with few points: of the others, the
+    lowest is used that has two more within _NEAR above it; without any, the lowest of the others.
+
+    Args:
+        z: Heights, ascending in each cell, shape (N,) [m].
+        starts, count: First point and number of points of each cell, shape (C,).
+    """
+    lowest = starts + count // 50
+    last = np.repeat(starts + count - 1, count)
+    above = np.arange(len(z)) + 2
+    is_supported = (above <= last) & (z[np.minimum(above, len(z) - 1)] - z < _NEAR)
+    is_supported &= np.arange(len(z)) >= np.repeat(lowest, count)
+    cell = np.repeat(np.arange(len(starts)), count)[is_supported]
+    found, first = np.unique(cell, return_index=True)
+    lowest[found] = np.flatnonzero(is_supported)[first]
+    return lowest
+
+
 def _lowest_surface(points: Float) -> tuple[float, float, float]:
     """Return the median slope between the lowest points of neighbouring cells (inf for few cells), the share
     of points near them, and the share of slopes beyond _STEEP.
@@ -237,7 +258,7 @@ def _lowest_surface(points: Float) -> tuple[float, float, float]:
     key, z = key[order], points[order, 2]
     starts = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
     count = np.diff(np.append(starts, len(key)))
-    low = z[starts + count // 50]  # two per cent may be noise below the ground
+    low = z[_supported(z, starts, count)]
     is_near: Bool = z - np.repeat(low, count) < _NEAR
     full = count >= _LEAST_IN_CELL
     if np.count_nonzero(full) < _LEAST_CELLS:

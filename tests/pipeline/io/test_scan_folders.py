@@ -416,10 +416,23 @@ def test_rows_of_a_text_found_by_its_name_are_as_many_as_the_scans(rows: int, tm
     assert "the motion is that in odometry.csv, which was found by its name" in description.warnings
 
 
-def test_several_texts_found_by_their_names_are_not_chosen_from(tmp_path: Path, opened: Opened):
+def test_of_several_texts_with_the_same_steps_the_one_with_most_poses_is_used(tmp_path: Path, opened: Opened):
+    untimed(tmp_path, 20)
+    (tmp_path / "times.txt").write_text(
+        "".join(f"{START_S}.{k}\n" for k in range(10)) + "".join(f"{START_S + 1}.{k}\n" for k in range(10))
+    )
+    drifting = [Pose3(pose.R, 1.03 * pose.t + [9.0, 0.0, 0.0]) for pose in curve(5)]
+    (tmp_path / "a_odom.csv").write_text(tum(drifting))
+    (tmp_path / "b_odom.csv").write_text(tum(curve(20)))
+    description = opened(tmp_path).description
+    assert description.has_odometry
+    assert "the motion is that in b_odom.csv, which was found by its name" in description.warnings
+
+
+def test_several_texts_with_other_steps_are_not_chosen_from(tmp_path: Path, opened: Opened):
     timed(tmp_path, 4)
-    for name in ("gps_odom.csv", "lidar_odom.csv"):
-        (tmp_path / name).write_text(tum(curve(9)))
+    (tmp_path / "gps_odom.csv").write_text(tum(curve(9)))
+    (tmp_path / "lidar_odom.csv").write_text(tum([Pose3(pose.R, 1.3 * pose.t) for pose in curve(9)]))
     description = opened(tmp_path).description
     assert not description.has_odometry
     assert any("none of gps_odom.csv, lidar_odom.csv is used" in text for text in description.warnings)
@@ -477,3 +490,55 @@ def test_names_too_far_away_in_time_are_numbers(first: int, tmp_path: Path, open
     description = opened(tmp_path).description
     assert not description.has_times
     assert description.scans == 3
+
+
+def test_numbers_of_frames_tell_the_scans_of_the_poses(tmp_path: Path, opened: Opened):
+    """The layout of KITTI-360, where frames are missing and the poses are those of an IMU with z down."""
+    drive = "2013_05_28_drive_0000_sync"
+    scans = tmp_path / "data_3d_raw" / drive / "velodyne_points" / "data"
+    scans.mkdir(parents=True)
+    for number in range(3, 11):
+        write(scans / f"{number:010d}.bin", number)
+    T_imu_camera = Pose3(
+        np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([1.5, 0, -0.6])
+    )
+    T_lidar_camera = Pose3(
+        np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.8, 0.1, -0.2])
+    )
+    T_imu_lidar = T_imu_camera @ T_lidar_camera.inverse()
+    calibration = tmp_path / "calibration"
+    calibration.mkdir()
+    (calibration / "calib_cam_to_pose.txt").write_text(
+        f"image_00: {matrices([T_imu_camera])}image_01: {matrices([T_imu_camera])}"
+    )
+    (calibration / "calib_cam_to_velo.txt").write_text(matrices([T_lidar_camera]))
+    poses = curve(12)
+    frames = [4, 5, 7, 9, 11]
+    rows = matrices([poses[k] @ T_imu_lidar.inverse() for k in frames]).splitlines()
+    (tmp_path / "data_poses" / drive).mkdir(parents=True)
+    (tmp_path / "data_poses" / drive / "poses.txt").write_text(
+        "".join(f"{k} {row}\n" for k, row in zip(frames, rows, strict=True))
+    )
+    found = [record for record in opened(scans).records() if isinstance(record, Odometry)]
+    assert [record.stamp_ns // 100_000_000 for record in found] == [4, 5, 7, 9]
+    for record, k in zip(found, frames, strict=False):
+        np.testing.assert_allclose(record.T_odom_base.t, poses[k].t, atol=1e-9)
+        np.testing.assert_allclose(record.T_odom_base.R, poses[k].R, atol=1e-9)
+
+
+def test_without_a_calibration_an_imu_has_only_other_axes(tmp_path: Path, opened: Opened):
+    untimed(tmp_path, 4)
+    turn = Pose3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    rows = matrices([pose @ turn for pose in curve(4)]).splitlines()
+    (tmp_path / "poses.txt").write_text("".join(f"{k} {row}\n" for k, row in enumerate(rows)))
+    found = [record for record in opened(tmp_path).records() if isinstance(record, Odometry)]
+    np.testing.assert_allclose([record.T_odom_base.R for record in found], [p.R for p in curve(4)], atol=1e-9)
+
+
+def test_numbers_of_other_frames_are_not_used(tmp_path: Path, opened: Opened):
+    untimed(tmp_path, 4)
+    rows = matrices(curve(4)).splitlines()
+    (tmp_path / "poses.txt").write_text("".join(f"{k + 50} {row}\n" for k, row in enumerate(rows)))
+    description = opened(tmp_path).description
+    assert not description.has_odometry
+    assert "poses.txt is not used: its frames are not those of the scans" in description.warnings

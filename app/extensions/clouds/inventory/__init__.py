@@ -1,7 +1,7 @@
 """Stem inventory of a whole cloud of a plot by a terrestrial or mobile scanner.
 
 The steps of `Inventory` are extent, ground, thinned points above it, upright columns, the circles along them,
-stems, crowns. The points are read three times in parts, so that the memory does not grow with their number.
+stems, crowns. The points are read several times in parts, so that the memory does not grow with their number.
 """
 
 from __future__ import annotations
@@ -63,7 +63,21 @@ NARROW, LONG_SIDE = 0.5, 4.0  # stems are as thick, and the cloud of a single on
 #: The highest tree that is known [m] (a coast redwood, 2019), and the distance from equator to pole [m],
 #: which no northing in metres exceeds.
 HIGHEST_TREE, LARGEST_NORTHING = 116.0, 1e7
-GIANT_HEIGHT, GIANT_DBH = 60.0, 0.8  # m; a pine of 20 m and 0.25 m has both if its feet are taken as metres
+#: Only 5 % of the land has trees above 30 m (Lang et al. 2023, Nature Ecology & Evolution 7, 1778), and a
+#: pine of 13 m and 0.2 m has both values [m] if its feet are taken as metres.
+GIANT_HEIGHT, GIANT_DBH = 40.0, 0.6
+#: First words of the warning about a unit, about stems that stand twice, and about upright objects of which
+#: none is a tree.
+UNIT_DOUBT = "the coordinates may be feet"
+TWICE = "stems stand twice in the cloud"
+NO_TREE = "no tree was found"
+#: Verdicts about upright objects that ground, noise or a wrong unit can also give to stems, and their fewest.
+UPRIGHT = (Verdict.POLE, Verdict.OTHER, Verdict.NO_ARC, Verdict.TOO_THIN, Verdict.TOO_THICK, Verdict.STUMP)
+FEWEST_UPRIGHT = 3
+#: Longest shift between two passes of a scanner that is searched (spacings of plantations are wider), its
+#: precision from pair to pair, the largest difference of two diameters of a stem [m], the fewest pairs, and
+#: the largest probability that as many pairs of stems, which stand at random, have the same shift.
+SHIFT_MAX, SHIFT_SIGMA, SAME_DBH, FEWEST_PAIRS, BY_CHANCE = 0.9, 0.04, 0.04, 3, 1e-3
 SHOWN, SHOWN_SIDE = 1 << 17, 0.02  # points of all heights that are kept, and smallest side of their cubes [m]
 
 
@@ -220,6 +234,7 @@ class Inventory:
             crowns = without_heights(crowns, "the sensor of the drive did not see above its field of view")
         trees = _trees(stems[order], np.radians(parameters.tracking.dbh_arc_min), crowns)
         doubt = _unit_doubt(self._cloud.description, trees.dbh, p.voxels.points[:, 3])
+        doubt += _no_tree(verdict) + _standing_twice(trees.position, trees.dbh)
         return PlotMap(
             trees=trees,
             stems=stems,
@@ -360,7 +375,49 @@ def _unit_doubt(about: CloudDescription, dbh: Float, above: Float32) -> list[str
         reason = f"a height of {high:.0f} m and a median DBH of {wide:.1f} m, which only giant trees have"
     else:
         return []
-    return [f"the coordinates may be feet: as metres they give {reason}; name the unit with --unit ft"]
+    return [f"{UNIT_DOUBT}: as metres they give {reason}; name the unit with --unit ft"]
+
+
+def _no_tree(verdict: Int32) -> list[str]:
+    """Return a warning if no candidate is a tree, but several are upright."""
+    n = int(np.isin(verdict, UPRIGHT).sum())
+    if (verdict == Verdict.TREE).any() or n < FEWEST_UPRIGHT:
+        return []
+    return [
+        f"{NO_TREE}, but {n} upright objects: the ground may not be found below noise, or the unit be "
+        "another one (see the refused objects)"
+    ]
+
+
+def _standing_twice(place: Float, dbh: Float) -> list[str]:
+    """Return a warning if several pairs of stems have the same shift and alike diameters: two passes of the
+    scanner that do not fit. In rows of a plantation the shift has another stem at its end.
+
+    Args:
+        place: Positions of the trees, shape (T, 2) [m].
+        dbh: Their diameters, NaN where unknown, shape (T,) [m].
+    """
+    from scipy.spatial import cKDTree
+    from scipy.special import bdtrc
+
+    if not len(place):
+        return []
+    pairs = cKDTree(place).query_pairs(SHIFT_MAX, output_type="ndarray")
+    unlike = np.abs(dbh[pairs[:, 0]] - dbh[pairs[:, 1]]) > SAME_DBH  # False where one is unknown
+    pairs = pairs[~unlike]
+    shift = place[pairs[:, 1]] - place[pairs[:, 0]]
+    shift *= np.where(shift[:, :1] < 0.0, -1.0, 1.0)
+    alike = np.hypot(*(shift[:, None] - shift[None]).T) < SHIFT_SIGMA
+    n = len(pairs)
+    most = alike[alike.sum(axis=1).argmax()] if n else np.zeros(0, np.bool_)
+    chance = n * bdtrc(most.sum() - 2.0, n - 1, 2.0 * (SHIFT_SIGMA / SHIFT_MAX) ** 2) if n else 1.0
+    if most.sum() < FEWEST_PAIRS or len(np.unique(pairs[most])) < 2 * most.sum() or chance > BY_CHANCE:
+        return []
+    x, y = np.median(shift[most], axis=0).tolist()
+    return [
+        f"{TWICE}: {most.sum()} pairs are {x:.2f}, {y:.2f} m apart, so two passes of the scanner do not fit; "
+        "register them anew"
+    ]
 
 
 def _sides(place: Float) -> tuple[float, float]:

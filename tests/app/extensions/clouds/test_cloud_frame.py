@@ -371,7 +371,7 @@ def test_feet_that_are_taken_as_metres_are_doubted(tmp_path, shared_data, capsys
 @pytest.mark.parametrize(
     ("dbh", "high", "north", "doubted"),
     [(0.3, 30.0, 5e6, False), (0.3, 30.0, 1.39e7, True), (0.3, 120.0, 0.0, True), (1.1, 112.0, 0.0, True),
-     (0.5, 80.0, 0.0, False), (1.5, 40.0, 0.0, False), (np.nan, 40.0, 9.9e6, False)],
+     (0.5, 80.0, 0.0, False), (1.5, 40.0, 0.0, False), (0.7, 45.0, 0.0, True), (np.nan, 40.0, 9.9e6, False)],
 )  # fmt: skip
 def test_only_numbers_that_are_hardly_metres_are_doubted(dbh, high, north, doubted):
     about = CloudDescription("c", "made", 9, np.array([0.0, north, 0.0]), "", "", unit=UNNAMED)

@@ -1,0 +1,85 @@
+"""Noise below the ground, stems that stand twice, and clouds in which no upright object is a tree."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.extensions.clouds.inventory import TWICE, _no_tree, _standing_twice, map_plot
+from app.extensions.clouds.plot_ground import ground_steps
+from app.sources.one_step import finish
+from pipeline.config import preset
+from pipeline.io.readers.clouds import open_cloud
+from pipeline.io.readers.up_axis import up_by_ground
+from pipeline.types.records import Verdict
+from tests.pipeline.plots import PLACES, Made, hill, plot
+
+FOREST = preset("forest")
+
+
+def noise_below(points, rng, *, depth, share):
+    """Points at random places and depths [m], as many as a share of the points."""
+    n = int(share * len(points))
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    x, y = rng.uniform(low, high, (n, 2)).T
+    return np.column_stack([x, y, rng.uniform(*depth, n)])
+
+
+@pytest.mark.parametrize(
+    ("depth", "share"), [((-6.0, -0.3), 0.01), ((-40.0, -5.0), 0.01), ((-4.0, -0.5), 0.01)]
+)
+@pytest.mark.parametrize("slope", [0.0, 0.35])
+def test_noise_below_the_ground_hides_no_stem(depth, share, slope):
+    rng = np.random.default_rng(1)
+    points = plot(rng, slope=slope)
+    noise = noise_below(points, rng, depth=depth, share=share)
+    noise[:, 2] += hill(noise[:, 0], noise[:, 1], slope)
+    cloud = np.vstack([points, noise])
+    assert up_by_ground(cloud)[0] == "z"
+    m = map_plot(Made(cloud), FOREST)
+    away = np.hypot(*(m.trees.position[:, None] - PLACES[:, :2]).transpose(2, 0, 1))
+    assert len(m.trees.number) == len(PLACES)
+    assert away.min(axis=0).max() < 0.03
+
+
+@pytest.mark.parametrize("name", ["pine_plot", "LPine1_demo", "MLS_Clip"])
+def test_noise_below_a_real_plot_changes_no_ground(shared_data, name):
+    cloud = open_cloud(str(shared_data / "forest" / f"{name}.laz"))
+    points = np.concatenate(list(cloud.parts()))[::2, :3].astype(np.float64)
+    rng = np.random.default_rng(2)
+    noise = noise_below(points, rng, depth=(-30.0, -1.0), share=0.01)
+    noise[:, 2] += np.percentile(points[:, 2], 1)
+    grounds = [
+        finish(ground_steps(Made(c), 45.0, band=(0.2, 3.0)))[0] for c in (points, np.vstack([points, noise]))
+    ]
+    x, y = grounds[0].covered_places()[grounds[0].seen[grounds[0].covered]].T
+    assert np.percentile(np.abs(grounds[0].at(x, y) - grounds[1].at(x, y)), 95) < 0.4
+    assert up_by_ground(np.vstack([points, noise])[::3])[0] == "z"
+
+
+@pytest.mark.parametrize(("pairs", "is_told"), [(2, False), (3, True), (6, True)])
+def test_stems_with_one_shift_stand_twice(pairs, is_told):
+    rng = np.random.default_rng(3)
+    place, dbh = rng.uniform(-10.0, 10.0, (14, 2)), rng.uniform(0.1, 0.4, 14)
+    again = place[:pairs] + np.array([0.3, -0.2]) + rng.normal(0.0, 0.006, (pairs, 2))
+    told = _standing_twice(np.vstack([place, again]), np.append(dbh, dbh[:pairs]))
+    assert [text.startswith(TWICE) for text in told] == [True] * is_told
+    assert not _standing_twice(place, dbh)
+
+
+def test_rows_and_dense_stems_stand_once():
+    rng = np.random.default_rng(4)
+    rows = np.stack(np.meshgrid(np.arange(0.0, 8.0, 0.8), np.arange(0.0, 8.0, 0.8)), axis=-1).reshape(-1, 2)
+    assert not _standing_twice(rows + rng.normal(0.0, 0.01, rows.shape), np.full(len(rows), 0.1))
+    for _ in range(20):
+        assert not _standing_twice(rng.uniform(-6.0, 6.0, (120, 2)), rng.uniform(0.06, 0.11, 120))
+    assert not _standing_twice(np.zeros((0, 2)), np.zeros(0))
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "is_told"),
+    [([Verdict.BUSH] * 9, False), ([Verdict.POLE] * 3, True), ([Verdict.OTHER] * 2, False), ([], False),
+     ([Verdict.POLE] * 5 + [Verdict.TREE], False)],
+)  # fmt: skip
+def test_upright_objects_without_a_tree_are_told(verdicts, is_told):
+    assert bool(_no_tree(np.array(verdicts, np.int32))) == is_told
