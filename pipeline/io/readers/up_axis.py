@@ -227,8 +227,8 @@ def _runs(place: NDArray[np.int64], axis: int) -> NDArray[np.int64]:
 def _supported(z: Float, starts: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index of the lowest point of each cell that is no noise below the ground, shape (C,).
 
-    Two per cent of the points of a cell may be noise, and more of a cell with few points: of the others, the
-    lowest is used that has two more within _NEAR above it; without any, the lowest of the others.
+    Two per cent of the points of a cell may be noise. Of the others, the lowest is used that has two more
+    within _NEAR above it; the lowest of all if there is none, or if two per cent are less than one point.
 
     Args:
         z: Heights, ascending in each cell, shape (N,) [m].
@@ -239,6 +239,7 @@ def _supported(z: Float, starts: NDArray[np.int64], count: NDArray[np.int64]) ->
     above = np.arange(len(z)) + 2
     is_supported = (above <= last) & (z[np.minimum(above, len(z) - 1)] - z < _NEAR)
     is_supported &= np.arange(len(z)) >= np.repeat(lowest, count)
+    is_supported &= np.repeat(lowest > starts, count)
     cell = np.repeat(np.arange(len(starts)), count)[is_supported]
     found, first = np.unique(cell, return_index=True)
     lowest[found] = np.flatnonzero(is_supported)[first]
