@@ -98,8 +98,9 @@ def read_pose_rows(path: Path) -> PoseRows:
         if times is not None and all(_FRAME.fullmatch(line[time[0]]) for line in lines):
             frames = times // 1_000_000_000
             is_imu = bool(np.median(matrices[:, 2, 2]) < 0.0)  # a LiDAR has z up
-            T_imu_lidar = _calibration_of_imu(path) if is_imu else None
-            return PoseRows(None, frames, _poses_of_matrices(matrices, T_imu_lidar))
+            T_imu_lidar = _calibration_of_imu(path) if is_imu else Pose3.identity()
+            poses = _poses_of_matrices(matrices, Pose3.identity())
+            return PoseRows(None, frames, [pose @ T_imu_lidar for pose in poses])
         T_camera_lidar = None if time else _calibration(path.with_name("calib.txt"))
         return PoseRows(times, None, _poses_of_matrices(matrices, T_camera_lidar))
     _check_positions(rows[:, :3])

@@ -417,13 +417,11 @@ def test_rows_of_a_text_found_by_its_name_are_as_many_as_the_scans(rows: int, tm
 
 
 def test_of_several_texts_with_the_same_steps_the_one_with_most_poses_is_used(tmp_path: Path, opened: Opened):
-    untimed(tmp_path, 20)
-    (tmp_path / "times.txt").write_text(
-        "".join(f"{START_S}.{k}\n" for k in range(10)) + "".join(f"{START_S + 1}.{k}\n" for k in range(10))
-    )
-    drifting = [Pose3(pose.R, 1.03 * pose.t + [9.0, 0.0, 0.0]) for pose in curve(5)]
+    untimed(tmp_path, 40)
+    (tmp_path / "times.txt").write_text("".join(f"{START_S + k // 10}.{k % 10}\n" for k in range(40)))
+    drifting = [Pose3(pose.R, 1.03 * pose.t + [9.0, 0.0, 0.0]) for pose in curve(16)]
     (tmp_path / "a_odom.csv").write_text(tum(drifting))
-    (tmp_path / "b_odom.csv").write_text(tum(curve(20)))
+    (tmp_path / "b_odom.csv").write_text(tum(curve(40)))
     description = opened(tmp_path).description
     assert description.has_odometry
     assert "the motion is that in b_odom.csv, which was found by its name" in description.warnings
