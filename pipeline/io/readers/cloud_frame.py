@@ -37,6 +37,9 @@ _NATIONAL = 10_000.0
 #: The unit of coordinates of a file that says nothing about it.
 UNNAMED = "metres, as the file names no unit"
 
+#: How it is known that another axis than z points up.
+TURNED = "by its ground and stems"
+
 _LARGEST = COORDINATE_LIMIT / UNITS["mm"]  # of a coordinate in any unit; larger ones are damaged
 _SAMPLED = 400_000  # points of a sample
 _PLACES = 16  # of the file from which they are taken
@@ -158,7 +161,7 @@ def frame_of(table: PointTable, sample: CloudSample, unit: str = "auto", up: str
         else:
             chosen, others = up_by_ground(metres)
             if chosen != "z":
-                up_words = "by its ground and stems"
+                up_words = TURNED
                 warnings.append(
                     f"{chosen} points up in the cloud by its ground and stems: it was turned, and x and y "
                     f"of the map are {turned_words(chosen)} of the file (--up z: as it is)"

@@ -46,7 +46,7 @@ from pipeline.classification import ForestOf, package_alone
 from pipeline.classification.forest import vote
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float
-from pipeline.io.readers.cloud_frame import UNNAMED
+from pipeline.io.readers.cloud_frame import TURNED, UNNAMED
 from pipeline.types.records import CloudDescription, Float32, Int, Int32, Trees, Verdict, WholeCloud
 
 COARSE = 0.04  # m; coarser thinning makes diameters less precise
@@ -234,7 +234,8 @@ class Inventory:
             crowns = without_heights(crowns, "the sensor of the drive did not see above its field of view")
         trees = _trees(stems[order], np.radians(parameters.tracking.dbh_arc_min), crowns)
         doubt = _unit_doubt(self._cloud.description, trees.dbh, p.voxels.points[:, 3])
-        doubt += _no_tree(verdict) + _standing_twice(trees.position, trees.dbh)
+        doubt += _no_tree(verdict, self._cloud.description.up, float(p.ground.seen.mean()))
+        doubt += _standing_twice(trees.position, trees.dbh)
         return PlotMap(
             trees=trees,
             stems=stems,
@@ -378,14 +379,23 @@ def _unit_doubt(about: CloudDescription, dbh: Float, above: Float32) -> list[str
     return [f"{UNIT_DOUBT}: as metres they give {reason}; name the unit with --unit ft"]
 
 
-def _no_tree(verdict: Int32) -> list[str]:
-    """Return a warning if no candidate is a tree, but several are upright."""
-    n = int(np.isin(verdict, UPRIGHT).sum())
-    if (verdict == Verdict.TREE).any() or n < FEWEST_UPRIGHT:
+def _no_tree(verdict: Int32, up: str, ground_seen: float) -> list[str]:
+    """Return a warning if no candidate is a tree, though several are upright, the cloud was turned, or hardly
+    any ground is seen: what is wrong with the cloud can hide all trees.
+
+    Args:
+        verdict: Verdicts of the candidates, shape (K,).
+        up: Words about the axis that points up, see `CloudDescription`.
+        ground_seen: Share of the plot with visible ground.
+    """
+    upright = int(np.isin(verdict, UPRIGHT).sum())
+    reasons = [f"{upright} upright objects were refused"] * (upright >= FEWEST_UPRIGHT)
+    reasons += [f"the cloud was turned (up is {up})"] * (TURNED in up)
+    reasons += ["hardly any ground is visible"] * (ground_seen < LITTLE_GROUND)
+    if (verdict == Verdict.TREE).any() or not reasons:
         return []
     return [
-        f"{NO_TREE}, but {n} upright objects: the ground may not be found below noise, or the unit be "
-        "another one (see the refused objects)"
+        f"{NO_TREE}, but {', and '.join(reasons)}: look for noise below the ground and at --unit and --up"
     ]
 
 

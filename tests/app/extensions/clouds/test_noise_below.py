@@ -9,6 +9,7 @@ from app.extensions.clouds.inventory import TWICE, _no_tree, _standing_twice, ma
 from app.extensions.clouds.plot_ground import ground_steps
 from app.sources.one_step import finish
 from pipeline.config import preset
+from pipeline.io.readers.cloud_frame import TURNED
 from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.up_axis import up_by_ground
 from pipeline.types.records import Verdict
@@ -77,9 +78,11 @@ def test_rows_and_dense_stems_stand_once():
 
 
 @pytest.mark.parametrize(
-    ("verdicts", "is_told"),
-    [([Verdict.BUSH] * 9, False), ([Verdict.POLE] * 3, True), ([Verdict.OTHER] * 2, False), ([], False),
-     ([Verdict.POLE] * 5 + [Verdict.TREE], False)],
+    ("verdicts", "up", "seen", "is_told"),
+    [([Verdict.BUSH] * 9, "z, as usual", 0.9, False), ([Verdict.POLE] * 3, "z, as usual", 0.9, True),
+     ([Verdict.OTHER] * 2, "z, as usual", 0.9, False), ([], "z, as usual", 0.9, False),
+     ([], f"-z, {TURNED}", 0.9, True), ([Verdict.BUSH], "z, as usual", 0.05, True),
+     ([Verdict.POLE] * 5 + [Verdict.TREE], f"-z, {TURNED}", 0.05, False)],
 )  # fmt: skip
-def test_upright_objects_without_a_tree_are_told(verdicts, is_told):
-    assert bool(_no_tree(np.array(verdicts, np.int32))) == is_told
+def test_no_tree_is_doubted_where_something_may_hide_all(verdicts, up, seen, is_told):
+    assert bool(_no_tree(np.array(verdicts, np.int32), up, seen)) == is_told
