@@ -250,7 +250,12 @@ class Inventory:
             crowns=crowns,
             counts=p.counts,
             voxel_size=p.near.side,
-            warnings=(*_warnings(self._cloud, p), *_too_thick(verdict, r_max), *doubt),
+            warnings=(
+                *_warnings(self._cloud, p),
+                *_too_thick(verdict, r_max),
+                *_too_thin(verdict, radii[0]),
+                *doubt,
+            ),
         )
 
     def close(self) -> None:
@@ -354,6 +359,15 @@ def _too_thick(verdict: Int32, r_max: float) -> list[str]:
         f"{words} thicker than the limit of {2.0 * r_max:g} m and not in the map; the parameter of the limit "
         "is detection.cloud_radius_max (a radius)"
     ] * (n > 0)
+
+
+def _too_thin(verdict: Int32, r_min: float) -> list[str]:
+    """Return a warning that names the limit if more stems are too thin for it than there are trees."""
+    n, trees = (int(np.count_nonzero(verdict == kind)) for kind in (Verdict.TOO_THIN, Verdict.TREE))
+    return [
+        f"{n} stems are thinner than the limit of {2.0 * r_min:g} m and not in the map; the parameter of the "
+        "limit is detection.radius_min (a radius)"
+    ] * (n >= FEWEST_UPRIGHT and n > trees)
 
 
 def _unit_doubt(about: CloudDescription, dbh: Float, above: Float32) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.extensions.clouds.inventory import TWICE, _no_tree, _standing_twice, map_plot
+from app.extensions.clouds.inventory import TWICE, _no_tree, _standing_twice, _too_thin, map_plot
 from app.extensions.clouds.plot_ground import ground_steps
 from app.sources.one_step import finish
 from pipeline.config import preset
@@ -86,3 +86,9 @@ def test_rows_and_dense_stems_stand_once():
 )  # fmt: skip
 def test_no_tree_is_doubted_where_something_may_hide_all(verdicts, up, seen, is_told):
     assert bool(_no_tree(np.array(verdicts, np.int32), up, seen)) == is_told
+
+
+@pytest.mark.parametrize(("thin", "trees", "is_told"), [(5, 4, True), (5, 5, False), (2, 0, False)])
+def test_stems_below_the_limit_of_a_radius_are_told_if_they_are_most(thin, trees, is_told):
+    told = _too_thin(np.array([Verdict.TOO_THIN] * thin + [Verdict.TREE] * trees, np.int32), 0.04)
+    assert ["limit of 0.08 m" in text for text in told] == [True] * is_told
