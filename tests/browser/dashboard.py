@@ -23,6 +23,12 @@ RUN = "sim:stand"
 HARMLESS = ("GPU stall", "GL Driver Message", "Automatic fallback to software WebGL")
 
 
+# Longer than the page wants a card to be on the screen before it is answered.
+CARD_SEEN = """async () => {
+  const { draft } = await import('/static/js/annotate/annotations.js');
+  while (!(performance.now() - draft.shownAt > 160)) await new Promise((resolve) => setTimeout(resolve, 20));
+}"""
+
 # Where viser's client and its pictures come from.
 SCENE = "**/viser/**"
 
@@ -199,8 +205,10 @@ class Dashboard:
         return self.page.locator(".tabs [role=tab]").all_inner_texts()
 
     def card_shown(self) -> None:
-        """Wait until the review card shows the selected tree; until then the review takes no answer."""
+        """Wait until the review card has shown the selected tree for a moment; until then the review takes no
+        answer."""
         self.until("() => document.getElementById('review').getAttribute('aria-busy') === 'false'")
+        self.page.evaluate(CARD_SEEN)
 
     def answer(self, key: str) -> None:
         """Press a key of the review once the card shows the selected tree."""

@@ -181,12 +181,14 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
 
 ANSWERS = """async (keys) => {
   const given = [], card = document.getElementById("review");
+  const { draft } = await import('/static/js/annotate/annotations.js');
   for (const key of keys) {
     const title = document.getElementById("review-title").textContent;
     const busy = card.getAttribute("aria-busy") !== "false";
     const event = new KeyboardEvent("keydown", { key, bubbles: true });
+    const isSeen = !busy && performance.now() - draft.shownAt >= 150;
     document.getElementById("map").dispatchEvent(event);
-    given.push([key, title, busy]);
+    given.push([key, title, busy, isSeen]);
     await new Promise((resolve) => setTimeout(resolve, 250));
   }
   return given;
@@ -201,9 +203,9 @@ def test_quick_answers_belong_to_the_tree_on_the_card(person: Dashboard):
     person.card_shown()
     given = page.evaluate(ANSWERS, list("yynynnsyynysnyny"))
     told: dict[int, str] = {}
-    for key, title, busy in given:
+    for key, title, busy, is_seen in given:
         assert busy == title.endswith("loading …")
-        if not busy:
+        if is_seen:
             told[int(title.split()[1])] = {"y": "tree", "n": "other", "s": "skipped"}[key]
     assert len(told) > 3
     number = len(told)
@@ -218,6 +220,33 @@ def test_quick_answers_belong_to_the_tree_on_the_card(person: Dashboard):
     last.get_by_role("button").click()
     person.until_server("/api/annotations", f"it.trees.length + it.skipped.length === {number - 1}")
     expect(last).to_be_hidden()
+    assert person.errors == []
+
+
+# Key presses at intervals [ms]; `repeat` is what a held key sends.
+PRESSES = """async ([key, number, wait, held]) => {
+  for (let k = 0; k < number; k++) {
+    const event = new KeyboardEvent("keydown", { key, bubbles: true, repeat: held && k > 0 });
+    document.getElementById("map").dispatchEvent(event);
+    if (wait) await new Promise((resolve) => setTimeout(resolve, wait));
+  }
+}"""
+
+
+def test_a_held_key_and_keys_faster_than_a_look_answer_for_no_unseen_tree(person: Dashboard):
+    page = person.page
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    expect(page.locator("#review-title")).to_be_hidden()
+    page.locator("#map").press("s")
+    toast = page.locator("#problem")
+    for number, (keys, wait, held) in enumerate([(8, 33, True), (2, 0, False), (2, 60, False)], start=1):
+        person.card_shown()
+        page.evaluate(PRESSES, ["y", keys, wait, held])
+        expect(toast).to_contain_text("Not counted: ")
+        person.until_server("/api/annotations", f"it.trees.length === {number}")
+        toast.get_by_role("button").click()
+    person.card_shown()
+    assert len(rows(person)) == 3
     assert person.errors == []
 
 

@@ -18,6 +18,9 @@ const SKIPPED = "skipped"; // class of an annotation that states nothing
 export const STATES = ["open", "confirmed", "rejected", "skipped"]; // of a found tree in the review
 const LARGEST_DBH = 1000; // [cm]
 const MOST_ANSWERED = 20; // answers to which the review returns
+// [ms] for which a card must have been on the screen before it is answered: what takes less is no judgement of its picture. People
+// need about 150 ms to recognise the content of a picture (Thorpe, Fize and Marlot, Nature 381, 1996).
+const LOOK = 150;
 export const NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .@-]{0,39}$/u;
 
 export const draft = {
@@ -27,6 +30,7 @@ export const draft = {
   moved: null, // {id, row, x, y} while an annotation is dragged or nudged
   kind: "other", // class of a rejected tree
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
+  shownAt: Infinity, // [ms] time since which it is on the screen
   answer: null, // {number, kind} of the last answer of the review
   answered: [], // numbers of the trees that were answered, the newest last
   error: "",
@@ -239,21 +243,26 @@ const updateVotes = throttled(async () => {
   news();
 }, VOTES_EVERY);
 
-// Answers whether the tree on the card is a tree, and goes on to the next one at once. While the card loads, or the answer before
-// is on its way, nothing is answered: the person has not seen that tree yet.
+// Answers whether the tree on the card is a tree, and goes on to the next one at once. Nothing is answered while the card loads or
+// has just come, because the person has not seen that tree yet, or while the answer before is on its way.
 export async function review(kind) {
   const tree = selectedTree();
   if (!tree) {
     draft.error = "Select a found tree first: click it on the map, or press S for the next one.";
     return news();
   }
-  if (draft.shown === tree.number && !answering.has(tree.number)) await answer(tree, kind);
-  else sayNotCounted(tree.number);
+  await answerIfSeen(tree, kind);
 }
 
-function sayNotCounted(number) {
-  showNews(answering.has(number) ? `Not counted: the answer before on tree ${number} is being stored.` : `Not counted: tree ${number} is still loading.`);
+async function answerIfSeen(tree, kind) {
+  const { number } = tree;
+  if (answering.has(number)) showNews(`Not counted: the answer before on tree ${number} is being stored.`);
+  else if (draft.shown !== number) showNews(`Not counted: tree ${number} was still loading.`);
+  else if (performance.now() - draft.shownAt < LOOK) showNews(`Not counted: tree ${number} had only just come into view.`);
+  else await answer(tree, kind);
 }
+
+export const sayHeld = () => showNews("Not counted: a key that is held down answers once.");
 
 async function answer(tree, kind) {
   const { number } = tree, seen = annotationOf(tree);
@@ -302,8 +311,7 @@ export async function skip() {
   const tree = selectedTree();
   draft.error = "";
   if (!tree || reviewOf(tree) !== "open" || answering.has(tree.number)) await next();
-  else if (draft.shown === tree.number) await answer(tree, SKIPPED);
-  else sayNotCounted(tree.number);
+  else await answerIfSeen(tree, SKIPPED);
 }
 
 // Selects the most doubtful open tree other than the selected one; without one, the skipped tree that follows the selected one.

@@ -110,7 +110,12 @@ export function fillCard() {
     return;
   }
   const old = evidence().dataset.tree !== String(tree.number), review = reviewOf(tree);
+  const before = draft.shown;
   draft.shown = old ? null : tree.number;
+  if (draft.shown !== before) {
+    draft.shownAt = Infinity; // until it is drawn
+    requestAnimationFrame(() => { draft.shownAt = performance.now(); });
+  }
   setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
   setText(byId("review-state"), review);
   byId("review-state").dataset.state = review;

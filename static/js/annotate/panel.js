@@ -8,7 +8,7 @@ import { throttled } from "../core/timing.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, redo, remove, review, reviewOf, rowOf, rows, sayHeld, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, startCard } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -216,7 +216,14 @@ export function annotateKey(event) {
     return true;
   }
   if (event.ctrlKey || event.metaKey || event.altKey) return false;
-  return keyOfChosen(event) || keyOfTab(event);
+  return keyOfChosen(event) || (event.repeat ? isHeld(event) : keyOfTab(event));
+}
+
+// A key that is held down repeats itself about 30 times per second: it neither answers nor switches again.
+function isHeld({ key, shiftKey }) {
+  const answers = ["y", "n", "s"].includes(key) || (shiftKey && key in CLASS_KEYS);
+  if (answers) sayHeld();
+  return answers || key === "a" || key === "r";
 }
 
 function keyOfChosen(event) {

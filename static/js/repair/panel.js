@@ -109,7 +109,7 @@ export function repairKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey) return false;
   if (event.key === "Escape") return endTool();
   if (event.key !== "Delete" || !selectedTree()) return false;
-  deleteTree();
+  if (!event.repeat) deleteTree();
   return true;
 }
 
