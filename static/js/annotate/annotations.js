@@ -318,7 +318,7 @@ export async function skip() {
 // The order needs the votes: a key pressed before they have arrived waits for them.
 async function next() {
   if (!votes.known) await updateVotes.now();
-  lookAt(following());
+  lookAt(following()[0]);
 }
 
 // Shows a tree in the review; none stays where the review is.
@@ -330,11 +330,11 @@ export function lookAt(tree) {
   news();
 }
 
-// The tree that the review shows after the selected one.
+// The trees that the review shows after the selected one, the next one first.
 export function following() {
-  const left = unreviewed();
-  const open = left.find((each) => each.number !== state.selected && reviewOf(each) === "open");
-  return open ?? left[(left.findIndex(({ number }) => number === state.selected) + 1) % left.length];
+  const left = unreviewed(), at = left.findIndex(({ number }) => number === state.selected);
+  const open = left.filter((each) => each.number !== state.selected && reviewOf(each) === "open");
+  return open.length ? open : [...left.slice(at + 1), ...left.slice(0, at + 1)];
 }
 
 // Selects the tree that was answered before the selected one; the newest answer if the selected tree has none.

@@ -13,6 +13,7 @@ import { annotating, annotationOf, draft, following, measureDbh, reviewOf, typed
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
+const AHEAD = 2; // trees whose stories are loaded ahead
 const KEPT = 4; // trees whose stories are loaded ahead or shown
 let shown = "", pictured = null; // version of the shown evidence; number of the tree of the camera picture
 const stories = new Map(); // of each subject the newest story: {index of the scan, promise}
@@ -30,15 +31,16 @@ export const card = (hint) => el("article", { id: "review", class: "review", "ar
 
 const subjectOf = (number) => `${state.annotations?.run} ${number} ${state.parameters?.revision} ${state.remapped?.revision}`;
 
-// The story of a tree at this scan, or, for `atAnyScan`, one that was loaded ahead while the run plays on.
+// {index, promise, explanation}: the story of a tree at this scan, or, for `atAnyScan`, one that was loaded ahead while the run
+// plays on; `explanation` is null until it has come.
 function story(number, atAnyScan = false) {
   const subject = subjectOf(number), { index } = state.map;
   let kept = stories.get(subject);
   if (!kept || (!atAnyScan && kept.index !== index)) {
-    kept = { index, promise: get(`/api/story/tree/${number}`) };
+    kept = { index, promise: get(`/api/story/tree/${number}`), explanation: null };
     stories.delete(subject);
     stories.set(subject, kept);
-    kept.promise.catch(() => stories.get(subject) === kept && stories.delete(subject));
+    kept.promise.then((explanation) => { kept.explanation = explanation; }, () => stories.get(subject) === kept && stories.delete(subject));
     for (const old of [...stories.keys()].slice(0, -KEPT)) stories.delete(old);
   }
   return kept;
@@ -49,26 +51,46 @@ const refresh = keepFresh(async () => {
   if (!tree) return;
   const { number } = tree, subject = subjectOf(number);
   if (`${subject} ${state.map.index}` === shown) return;
-  let points, votes = "", loaded = "";
   try {
-    const kept = story(number, evidence().dataset.tree !== String(number)), explanation = await kept.promise;
-    const [figures] = ofExtensions("treeEvidence", explanation);
-    points = figures ?? gatheredFigure(explanation);
-    if (!figures) votes = columnFigure(explanation.column, "Votes on the accumulated scans");
-    loaded = `${subject} ${kept.index}`;
+    const kept = story(number, evidence().dataset.tree !== String(number));
+    await kept.promise;
+    if (state.selected !== number) return; // another tree was selected meanwhile, or none
+    showStory(number, kept);
   } catch (error) {
-    points = el("p", { class: "empty", text: capital(error.message) });
+    if (state.selected === number) showEvidence(number, "", el("p", { class: "empty", text: capital(error.message) }));
   }
-  if (state.selected !== number) return; // another tree was selected meanwhile, or none
-  shown = loaded;
+  if (shown && shown !== `${subject} ${state.map?.index}`) again(); // it was loaded ahead, at an earlier scan
+  loadAhead();
+}, PAUSE);
+
+function loadAhead() {
+  for (const { number } of following().slice(0, AHEAD)) story(number, true).promise.catch(() => undefined); // the card shows its error when it comes to it
+}
+
+function showStory(number, { index, explanation }) {
+  const [figures] = ofExtensions("treeEvidence", explanation);
+  const votes = figures ? "" : columnFigure(explanation.column, "Votes on the accumulated scans");
+  showEvidence(number, `${subjectOf(number)} ${index}`, figures ?? gatheredFigure(explanation), votes);
+}
+
+function showEvidence(number, version, points, votes = "") {
+  shown = version;
   evidence().replaceChildren(points);
   byId("review-votes").replaceChildren(votes);
   evidence().dataset.tree = String(number);
   fillCard();
-  if (loaded && loaded !== `${subject} ${state.map.index}`) again(); // it was loaded ahead, at an earlier scan
-  const ahead = following();
-  if (ahead) story(ahead.number, true).promise.catch(() => undefined); // the card shows its error when it comes to it
-}, PAUSE);
+}
+
+// What was loaded ahead is shown at once.
+function select() {
+  const tree = annotating() ? selectedTree() : null;
+  const kept = tree && evidence().dataset.tree !== String(tree.number) ? stories.get(subjectOf(tree.number)) : null;
+  if (kept?.explanation) {
+    showStory(tree.number, kept);
+    loadAhead();
+  }
+  refresh();
+}
 
 const again = throttled(refresh, EVERY);
 
@@ -127,5 +149,5 @@ export function fillCard() {
 
 export function startCard() {
   on("map", throttled(refresh, EVERY));
-  on("tab selection", refresh);
+  on("tab selection", select);
 }
