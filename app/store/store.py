@@ -8,7 +8,8 @@ content. A change can be undone while it is still the last one of its annotation
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields
 from hashlib import sha256
 from pathlib import Path
@@ -20,7 +21,9 @@ from sqlalchemy import (
     Engine,
     Insert,
     Row,
+    ScalarSelect,
     Select,
+    case,
     delete,
     func,
     insert,
@@ -511,15 +514,7 @@ class Store:
             StaleError: The run has a reference system (FRAME) already, and the contents have one; none is
                 added.
         """
-        with self._engine.begin() as connection:
-            counted = select(func.count()).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
-            if connection.execute(counted).scalar_one() + len(contents) > MOST_ANNOTATIONS:
-                raise StemmapError(f"a run may have {MOST_ANNOTATIONS} annotations")
-            frame = _frame(connection, run)
-            if frame is not None and any(content.kind == FRAME for content in contents):
-                raise _stale(frame)
-            step = self._step(connection, run, author)
-            return [self._add(connection, run, step, author, content) for content in contents]
+        return self.edit(run, author, contents, ())
 
     def change(self, run: int, author: Author, id_: int, version: int, content: Content | None) -> None:
         """Change the content of an annotation, or delete it, in one step. The same content as before changes
@@ -538,62 +533,96 @@ class Store:
             StaleError: The annotation has another version or is deleted; the message names author and time of
                 the last change.
         """
-        with self._engine.begin() as connection:
-            row = connection.execute(
-                select(_annotations).where(_annotations.c.id == id_, _annotations.c.run == run)
-            ).one_or_none()
-            if row is None or (content is not None and (content.values is None) != (row.plot is None)):
-                raise UnknownError("there is no such annotation", where=f"annotation {id_}")
-            if row.version != version or row.deleted:
-                raise _stale(row)
-            if content != _content(row):
-                self._change(connection, self._step(connection, run, author), author, row, content)
+        self.edit(run, author, (), [(id_, version, content)])
 
-    def undo(self, run: int, author: Author) -> None:
+    def edit(
+        self,
+        run: int,
+        author: Author,
+        added: Sequence[Content],
+        changed: Sequence[tuple[int, int, Content | None]],
+    ) -> list[int]:
+        """Add and change annotations in one step and return the ids of the added ones; errors as in `add` and
+        `change`, then nothing changes.
+
+        Args:
+            run: Number of the source, see `open_run`.
+            author: Author of the edit.
+            added: Contents of new annotations.
+            changed: Id, version and new content of each changed annotation, as in `change`.
+        """
+        with self._engine.begin() as connection:
+            counted = select(func.count()).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
+            if added and connection.execute(counted).scalar_one() + len(added) > MOST_ANNOTATIONS:
+                raise StemmapError(f"a run may have {MOST_ANNOTATIONS} annotations")
+            frame = _frame(connection, run)
+            if frame is not None and any(content.kind == FRAME for content in added):
+                raise _stale(frame)
+            rows = [
+                (_to_change(connection, run, id_, version, content), content)
+                for id_, version, content in changed
+            ]
+            rows = [(row, content) for row, content in rows if content != _content(row)]
+            if not added and not rows:
+                return []
+            kinds = [*(content.kind for content in added), *(row.kind for row, _ in rows)]
+            step = self._step(connection, run, author, {_subject(kind) for kind in kinds})
+            ids = [self._add(connection, run, step, author, content) for content in added]
+            for row, content in rows:
+                self._change(connection, step, author, row, content)
+            return ids
+
+    def undo(self, run: int, author: Author, subjects: Sequence[str] = ()) -> None:
         """Undo the last step of a browser that is not undone, with all its annotations.
 
         Args:
             run: Number of the source, see `open_run`.
             author: Author, with the browser.
+            subjects: Only steps of these subjects are considered, see `steps`; empty for all steps.
 
         Raises:
             StemmapError: There is no step to undo.
             StaleError: An annotation of the step was changed since, or the run would get a second reference
                 system; nothing is undone, and the step is skipped from now on.
         """
-        self._turn(run, author, "undone")
+        self._turn(run, author, "undone", subjects)
 
-    def redo(self, run: int, author: Author) -> None:
+    def redo(self, run: int, author: Author, subjects: Sequence[str] = ()) -> None:
         """Redo the step that a browser undid last; arguments and errors as in `undo`."""
-        self._turn(run, author, "done")
+        self._turn(run, author, "done", subjects)
 
-    def steps(self, run: int, browser: str) -> tuple[int, int]:
-        """Return the numbers of steps that a browser can undo and redo.
+    def steps(self, run: int, browser: str) -> tuple[dict[str, int], dict[str, int]]:
+        """Return the numbers of steps that a browser can undo and redo, as dicts from the subject of the
+        steps: "tree" for annotations of KINDS and SKIPPED, else the class of the first annotation of a step.
 
         Args:
             run: Number of the source, see `open_run`.
             browser: Identifier of the browser.
         """
-        query = select(_steps.c.state, func.count()).where(
-            _steps.c.run == run, _steps.c.browser == browser, _steps.c.state != "left"
+        query = select(_steps.c.state, _subject_of_step().label("subject")).where(
+            _steps.c.run == run, _steps.c.browser == browser
         )
+        undo, redo = Counter[str](), Counter[str]()
         with self._engine.begin() as connection:
-            counts = {str(state): int(n) for state, n in connection.execute(query.group_by(_steps.c.state))}
-        return counts.get("done", 0), counts.get("undone", 0)
+            for state, subject in connection.execute(query):
+                {"done": undo, "undone": redo}.get(state, Counter())[subject] += 1
+        return dict(undo), dict(redo)
 
     # --- one edit --------------------------------------------------------------------------------
 
-    def _step(self, connection: Connection, run: int, author: Author) -> int:
-        """Store a new step of a browser and return its number; steps that this browser undid before can no
-        longer be redone.
+    def _step(self, connection: Connection, run: int, author: Author, subjects: Collection[str]) -> int:
+        """Store a new step of a browser and return its number; steps of the same subjects that this browser
+        undid before can no longer be redone.
 
         Args:
             connection: Connection with an open transaction.
             run: Number of the source.
             author: Author of the edit, with the browser.
+            subjects: Subjects of the annotations of the step, see `steps`.
         """
-        of_browser = (_steps.c.run == run, _steps.c.browser == author.browser)
-        connection.execute(update(_steps).where(*of_browser, _steps.c.state == "undone").values(state="left"))
+        undone = (_steps.c.run == run, _steps.c.browser == author.browser, _steps.c.state == "undone")
+        same = _subject_of_step().in_(subjects)
+        connection.execute(update(_steps).where(*undone, same).values(state="left"))
         values = {"browser": author.browser, "who": author.who, "at_ns": self._clock(), "state": "done"}
         return _inserted(connection, insert(_steps).values(run=run, **values))
 
@@ -663,7 +692,7 @@ class Store:
 
     # --- back and forth --------------------------------------------------------------------------
 
-    def _turn(self, run: int, author: Author, to: Literal["done", "undone"]) -> None:
+    def _turn(self, run: int, author: Author, to: Literal["done", "undone"], subjects: Sequence[str]) -> None:
         """Undo or redo the next step of a browser. If an annotation of the step was changed since, or the run
         would get a second reference system, nothing is undone or redone, and the step can never be undone or
         redone again.
@@ -672,13 +701,14 @@ class Store:
             run: Number of the source.
             author: Author, with the browser.
             to: State of the step afterwards: "undone" or "done".
+            subjects: Subjects of the steps, empty for all.
 
         Raises:
             StemmapError: There is no such step.
             StaleError: An annotation of the step was changed, or a reference system was added, since.
         """
         with self._engine.begin() as connection:
-            step = _next_step(connection, run, author, to)
+            step = _next_step(connection, run, author, to, subjects)
             query = select(_changes).where(_changes.c.step == step).order_by(_changes.c.id)
             pairs = [
                 (change, _row(connection, change.annotation)) for change in connection.execute(query).all()
@@ -717,7 +747,7 @@ def _request_of(connection: Connection, run: Row[Any]) -> SourceRequest:
     )
 
 
-def _next_step(connection: Connection, run: int, author: Author, to: str) -> int:
+def _next_step(connection: Connection, run: int, author: Author, to: str, subjects: Sequence[str]) -> int:
     """Return the number of the next step to undo or redo.
 
     Args:
@@ -725,6 +755,7 @@ def _next_step(connection: Connection, run: int, author: Author, to: str) -> int
         run: Number of the source.
         author: Author, with the browser.
         to: State after the step: "undone" or "done".
+        subjects: Subjects of the steps, empty for all.
 
     Raises:
         StemmapError: There is no such step.
@@ -732,12 +763,46 @@ def _next_step(connection: Connection, run: int, author: Author, to: str) -> int
     # Undone steps follow the active ones and were undone from the end.
     newest, state = (func.max, "done") if to == "undone" else (func.min, "undone")
     query = select(newest(_steps.c.id)).where(
-        _steps.c.run == run, _steps.c.browser == author.browser, _steps.c.state == state
+        _steps.c.run == run,
+        _steps.c.browser == author.browser,
+        _steps.c.state == state,
+        _subject_of_step().in_(subjects) if subjects else true(),
     )
     step = connection.execute(query).scalar()
     if step is None:
         raise StemmapError(f"there is nothing to {'undo' if to == 'undone' else 'do again'}")
     return int(step)
+
+
+def _subject(kind: str) -> str:
+    """Return the subject of an annotation of a class, see `Store.steps`."""
+    return "tree" if kind in (*KINDS, SKIPPED) else kind
+
+
+def _subject_of_step() -> ScalarSelect[str]:
+    """Return the subject of a step, that of its first annotation, as an expression of the row of `steps`."""
+    kind = _annotations.c.kind
+    return (
+        select(case((kind.in_((*KINDS, SKIPPED)), "tree"), else_=kind))
+        .join(_changes, _changes.c.annotation == _annotations.c.id)
+        .where(_changes.c.step == _steps.c.id)
+        .order_by(_changes.c.id)
+        .limit(1)
+        .correlate(_steps)
+        .scalar_subquery()
+    )
+
+
+def _to_change(connection: Connection, run: int, id_: int, version: int, content: Content | None) -> Row[Any]:
+    """Return the row of an annotation that is changed; arguments and errors as in `Store.change`."""
+    row = connection.execute(
+        select(_annotations).where(_annotations.c.id == id_, _annotations.c.run == run)
+    ).one_or_none()
+    if row is None or (content is not None and (content.values is None) != (row.plot is None)):
+        raise UnknownError("there is no such annotation", where=f"annotation {id_}")
+    if row.version != version or row.deleted:
+        raise _stale(row)
+    return row
 
 
 def _row(connection: Connection, id_: int) -> Row[Any]:

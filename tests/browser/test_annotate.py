@@ -170,9 +170,9 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     person.until_server("/api/annotations", "it.trees.length === 2")
     mine = page.evaluate("() => localStorage.getItem('stemmap.browser')")
     edits = f"/api/annotations?browser={mine}"
-    for left in range(person.ask(edits)["undo"] - 1, -1, -1):
+    for left in range(person.ask(edits)["undo"]["tree"] - 1, -1, -1):
         page.locator("#annotate-undo").click()
-        person.until_server(edits, f"it.undo === {left}")
+        person.until_server(edits, f"(it.undo.tree ?? 0) === {left}")
     assert rows(person) == []
     expect(page.locator("#annotate-undo")).to_be_disabled()
     person.until_server("/api/evaluation", f"it.FA.count === {before['FA']['count']}")

@@ -187,3 +187,31 @@ def test_a_repair_that_does_not_apply_says_so(person: Dashboard):
     expect(person.page.locator("#repairs li")).to_contain_text(
         "delete a tree at 500.0, 0.0Not applied: no tree is within 0.5 m of 500.00, 0.00"
     )
+
+
+def test_undo_of_a_tab_takes_back_nothing_of_another_tab(person: Dashboard):
+    page, tree = person.page, apart(trees(person))[0]
+    person.tab("Annotate")
+    click(person, tree["x"], tree["y"])
+    person.answer("y")
+    person.until_server("/api/annotations", "it.trees.length === 1")
+    for tab, button in (("Repair", "#repair-undo"), ("Plots", "#plot-undo")):
+        person.tab(tab)
+        expect(page.locator(button)).to_be_disabled()
+        page.locator("#map").press("Control+z")
+    expect(page.locator("#plots-error")).to_contain_text("nothing to undo")
+    assert len(person.ask("/api/annotations")["trees"]) == 1
+
+    person.tab("Repair")
+    click(person, tree["x"], tree["y"])
+    page.locator("#repair-delete").click()
+    person.until_server("/api/annotations", "it.others.repair?.length === 1")
+    person.tab("Annotate")
+    page.locator("#annotate-undo").click()
+    person.until_server("/api/annotations", "it.trees.length === 0")
+    expect(page.locator("#problem")).to_contain_text("Undone: 1 annotation.")
+    expect(page.locator("#annotate-undo")).to_be_disabled()
+    person.tab("Repair")
+    page.locator("#repair-undo").click()
+    expect(page.locator("#repairs li")).to_have_count(0)
+    assert [error for error in person.errors if "409" not in error] == []

@@ -248,8 +248,8 @@ class Edit(Body):
 
 async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], status: int = 200) -> Response:
     """Return a JSON response with the keys of `payload`, `serial`, the number of edits so far, and `undo` and
-    `redo`, the numbers of edits of this browser that can be undone and redone. Raises StemmapError if the
-    store cannot be used.
+    `redo`, the numbers of edits of this browser that can be undone and redone, see `Store.steps`. Raises
+    StemmapError if the store cannot be used.
 
     Args:
         dashboard: The dashboard.
@@ -259,8 +259,8 @@ async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], stat
     """
     serial = dashboard.annotation_editor.serial
     steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, edit.browser))
-    undo_count, redo_count = steps or (0, 0)
-    return json_reply({**payload, "serial": serial, "undo": undo_count, "redo": redo_count}, status)
+    undo, redo = steps or ({}, {})
+    return json_reply({**payload, "serial": serial, "undo": undo, "redo": redo}, status)
 
 
 async def apply_edit(

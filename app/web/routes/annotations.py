@@ -47,6 +47,12 @@ class _Delete(Edit):
     version: Number
 
 
+class _Turn(Edit):
+    """Undo or redo; `subjects` are those of the tab in which it is pressed, see `Store.steps`."""
+
+    subjects: Annotated[list[Annotated[str, Field(max_length=10)]], Field(max_length=10, default=[])]
+
+
 class _ImportTable(Edit):
     """A table of trees as text; `dbh_unit` is the unit of a column `dbh` whose header does not name it."""
 
@@ -62,12 +68,12 @@ class _TruthChoice(Body):
 
 @router.get("/annotations")
 async def read(dashboard: Dash, browser: str = "") -> Response:
-    """Return the annotations of the run, and how many edits this browser can undo and redo; both 0 without a
-    run or with an invalid name of the browser."""
+    """Return the annotations of the run, and how many edits this browser can undo and redo, see
+    `Store.steps`; none without a run or with an invalid name of the browser."""
     steps = None
     if re.fullmatch(BROWSER, browser):
         steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, browser))
-    undo, redo = steps or (0, 0)
+    undo, redo = steps or ({}, {})
     return json_reply({**dashboard.annotation_editor.as_plain(), "undo": undo, "redo": redo})
 
 
@@ -97,18 +103,20 @@ async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
 
 
 @router.post("/annotations/undo")
-async def undo(body: Edit, dashboard: Dash) -> Response:
-    """Undo the last edit of the browser; return the counts of edits, see `edited`. 409 if there is none, if
-    another person has changed the annotation since, or if another run was opened."""
-    await apply_edit(dashboard, body, Store.undo)
+async def undo(body: _Turn, dashboard: Dash) -> Response:
+    """Undo the last edit of the browser, of these subjects if there are any; return the counts of edits, see
+    `edited`. 409 if there is none, if another person has changed the annotation since, or if another run was
+    opened."""
+    await apply_edit(dashboard, body, Store.undo, body.subjects)
     return await edited(dashboard, body, {})
 
 
 @router.post("/annotations/redo")
-async def redo(body: Edit, dashboard: Dash) -> Response:
-    """Repeat the edit that the browser undid last; return the counts of edits, see `edited`. 409 if there is
-    none, if another person has changed the annotation since, or if another run was opened."""
-    await apply_edit(dashboard, body, Store.redo)
+async def redo(body: _Turn, dashboard: Dash) -> Response:
+    """Repeat the edit that the browser undid last, of these subjects if there are any; return the counts of
+    edits, see `edited`. 409 if there is none, if another person has changed the annotation since, or if
+    another run was opened."""
+    await apply_edit(dashboard, body, Store.redo, body.subjects)
     return await edited(dashboard, body, {})
 
 

@@ -34,8 +34,8 @@ export const draft = {
   answer: null, // {number, kind} of the last answer of the review
   answered: [], // numbers of the trees that were answered, the newest last
   error: "",
-  undo: 0,
-  redo: 0,
+  undo: {}, // numbers of edits that can be undone, by their subject
+  redo: {},
 };
 const NO_VOTES = { needed: 0, of: new Map(), known: false };
 let votes = NO_VOTES; // of the decision trees for each found tree, by its number
@@ -141,8 +141,17 @@ export function remove(row) {
   return edit(() => call("DELETE", `/${row.id}`, { version: latest(row) }));
 }
 
-export const undo = () => turn("/undo", "Undone");
-export const redo = () => turn("/redo", "Redone");
+// Undo and redo of a tab: of the edits of its subjects only, so that it takes back nothing that another tab shows.
+export function historyOf(...subjects) {
+  const any = (edits) => subjects.some((subject) => edits[subject]);
+  return {
+    undo: () => turn("/undo", "Undone", subjects),
+    redo: () => turn("/redo", "Redone", subjects),
+    canUndo: () => any(draft.undo),
+    canRedo: () => any(draft.redo),
+  };
+}
+export const reviewHistory = historyOf("tree");
 
 const edited = () => ({
   annotation: [...rows(), ...skips()],
@@ -150,15 +159,15 @@ const edited = () => ({
   "coordinate system": [state.annotations?.frame].filter(Boolean),
 });
 
-// All classes of annotations have one history: tells what the step changed, and selects the tree of a single annotation.
-async function turn(where, word) {
+// Tells what the step changed, and selects the tree of a single annotation.
+async function turn(where, word, subjects) {
   const run = state.annotations?.run;
   settle(); // queued before
   draft.answer = null;
   let before = null;
   const done = await edit(() => {
     before = edited();
-    return call("POST", where);
+    return call("POST", where, { subjects });
   });
   if (!done || run !== state.annotations?.run) return;
   const after = edited();

@@ -8,7 +8,7 @@ import { throttled } from "../core/timing.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, redo, remove, review, reviewOf, rowOf, rows, sayHeld, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, remove, review, reviewHistory, reviewOf, rowOf, rows, sayHeld, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, startCard } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -17,6 +17,7 @@ const EVERY = 300; // [ms] between two updates while a run plays
 const SHOWN_ANSWERS = 5;
 const LARGEST_TABLE = 900_000; // [bytes]
 const lines = new Map(); // rows of the table by the id of the annotation
+const { undo, redo, canUndo, canRedo } = reviewHistory;
 let imported = ""; // result of the last import
 
 function build() {
@@ -37,7 +38,7 @@ function build() {
     el("div", { class: "annotate-head" },
       el("p", { id: "annotate-count", class: "annotate-count" }),
       button("annotate-add", "Add (A)", "Add trees by clicks on the map (A)", () => toggleAdding()),
-      button("annotate-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
+      button("annotate-undo", "Undo", "Undo your last annotation (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
     el("div", { id: "annotate-states", class: "annotate-tools", role: "group", "aria-label": "Found trees by review state" }, ...STATES.map((each) =>
       button(`annotate-${each}`, each, `List the ${each} trees`, () => showTrees(each), "quiet small"))),
     el("div", { class: "review-buttons", role: "group", "aria-label": "Is the selected found tree a tree?" },
@@ -128,8 +129,8 @@ function fill() {
   const found = trees().length, left = unreviewed();
   const selected = selectedTree();
   setText(byId("annotate-count"), state.map ? `${found - left.length} of ${count(found, "tree")} reviewed` : "Nothing mapped yet");
-  byId("annotate-undo").disabled = !draft.undo;
-  byId("annotate-redo").disabled = !draft.redo;
+  byId("annotate-undo").disabled = !canUndo();
+  byId("annotate-redo").disabled = !canRedo();
   for (const id of ["add", "import"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !state.annotations?.run;
   for (const id of ["yes", "no"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !selected;
   byId("annotate-next").disabled = !left.length;
@@ -204,7 +205,7 @@ const ARROWS = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP
 
 export const ANNOTATE_KEYS = [
   ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["shift P H B O", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
-  ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "undo and redo an edit"], ["shift+click", "in the 3D scene: add a tree there"],
+  ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "in the tabs Annotate, Repair and Plots: undo and redo an edit of the tab"], ["shift+click", "in the 3D scene: add a tree there"],
 ];
 
 // Returns whether the key belonged to the tab.

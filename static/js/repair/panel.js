@@ -1,6 +1,6 @@
 // The tab Repair: tools for trees and loops, and the list of repairs.
 
-import { draft, redo, undo } from "../annotate/annotations.js";
+import { draft, historyOf } from "../annotate/annotations.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { count } from "../core/format.js";
 import { on, selectedTree, state } from "../core/store.js";
@@ -22,6 +22,7 @@ const DONE = {
   merge: (a, b) => b && `tree ${b} merged into tree ${a}`, split: (a) => `tree ${a} split`, move: (a) => `tree ${a} moved`, class: (a, b, value) => `tree ${a}: class ${value}`,
   delete: (a) => `tree ${a} deleted`, tie: (a, b) => b && (a === b ? `tree ${a} at the same place` : `same place: trees ${a} and ${b}`), forbid: () => "",
 };
+const { undo, redo, canUndo, canRedo } = historyOf("repair");
 const LARGEST_FILE = 900_000; // [bytes]
 
 function build() {
@@ -41,7 +42,7 @@ function build() {
   byId("panel-repair").replaceChildren(
     el("div", { class: "annotate-head" },
       el("p", { id: "repair-count", class: "annotate-count" }),
-      button("repair-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("repair-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
+      button("repair-undo", "Undo", "Undo your last repair (Ctrl+Z)", undo), button("repair-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
     el("div", { class: "annotate-tools", role: "group", "aria-label": "Repair trees" }, el("span", { class: "dim", text: "Trees" }), ...tools(TOOLS), kind,
       button("repair-delete", "Delete", "The selected tree is no tree of this map (Del)", deleteTree)),
     el("div", { class: "annotate-tools", role: "group", "aria-label": "Repair loops" }, el("span", { class: "dim", text: "Loops" }), ...tools(LOOPS)),
@@ -77,8 +78,8 @@ function fill() {
   const known = problems.length === rows.length && state.map?.repairs === state.annotations?.repairs; // else the map does not have them yet
   const left = known ? problems.filter(Boolean).length : 0;
   setText(byId("repair-count"), rows.length ? `${count(rows.length, "repair")}${left ? `, ${left} not applied` : ""}` : "No repairs");
-  byId("repair-undo").disabled = !draft.undo;
-  byId("repair-redo").disabled = !draft.redo;
+  byId("repair-undo").disabled = !canUndo();
+  byId("repair-redo").disabled = !canRedo();
   const blocked = Boolean(state.annotations?.problem) || !state.map;
   for (const [name] of [...TOOLS, ...LOOPS]) {
     byId(`repair-${name}`).disabled = blocked;

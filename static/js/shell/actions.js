@@ -1,6 +1,6 @@
 // All actions of the dashboard in one table; the keys, the list of shortcuts and the palette are made from it.
 
-import { annotating, draft, previous, redo as redoEdit, skip, toggleAdding, review, undo as undoEdit } from "../annotate/annotations.js";
+import { annotating, draft, previous, review, reviewHistory, skip, toggleAdding } from "../annotate/annotations.js";
 import { byId } from "../core/dom.js";
 import { select } from "../core/live_feed.js";
 import { edits } from "../core/permissions.js";
@@ -86,7 +86,7 @@ export const ACTIONS = [
   ...["pole", "person", "bush", "other"].map((kind) => [`Annotate: the selected tree is of the class ${kind}`, `shift ${kind === "person" ? "h" : kind[0]}`, "", inAnnotate(() => review(kind)), ""]),
   ["Annotate: return to the tree of the answer before", "r", "", inAnnotate(previous), ""],
   ["Annotate: delete the chosen annotation", "del", "", inAnnotate(() => document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "Delete", bubbles: true }))), "", "remove erase"],
-  ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: redo your last edit", "", "", inAnnotate(redoEdit)],
+  ["Annotate: undo your last annotation", "", "", inAnnotate(reviewHistory.undo)], ["Annotate: redo your last annotation", "", "", inAnnotate(reviewHistory.redo)],
   ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],
   ...[["merge two trees", "merge"], ["split a tree", "split"], ["move a tree", "move"], ["the same place was seen twice: close a loop", "tie"], ["forbid a wrong loop", "forbid"]].map(([text, kind]) =>
     [`Repair: ${text}`, "", "", edits(() => { toTab("repair")(); useTool(kind); }), null, "mend correct fix edit map"]),

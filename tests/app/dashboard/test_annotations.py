@@ -70,7 +70,7 @@ async def test_a_tree_is_added_changed_deleted_and_all_is_undone(both: Running) 
     client, _ = both
     added = await edit(client, "POST", x=1.25, y=-2.0, dbh_cm=31.5)
     assert added.status_code == 201
-    assert (added.json()["undo"], added.json()["redo"]) == (1, 0)
+    assert (added.json()["undo"], added.json()["redo"]) == ({"tree": 1}, {})
     (row,) = await rows(client)
     assert (row["x"], row["y"], row["kind"], row["dbh_cm"], row["who"], row["version"]) == (
         1.25,
@@ -93,7 +93,7 @@ async def test_a_tree_is_added_changed_deleted_and_all_is_undone(both: Running) 
     nothing = await edit(client, "POST", "/undo")
     assert nothing.status_code == 409
     assert "nothing to undo" in nothing.json()["error"]["what"]
-    assert (await edit(client, "POST", "/redo")).json()["redo"] == 2
+    assert (await edit(client, "POST", "/redo")).json()["redo"] == {"tree": 2}
     assert [r["kind"] for r in await rows(client)] == ["tree"]
 
 
@@ -200,9 +200,9 @@ async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
     assert unsaid.status_code == 422
     assert "unit" in unsaid.json()["error"]["what"]
     answer = (await edit(client, "POST", "/import", table=table, dbh_unit="m")).json()
-    assert (answer["added"], answer["left_out"], answer["undo"]) == (2, 0, 1)
+    assert (answer["added"], answer["left_out"], answer["undo"]) == (2, 0, {"tree": 1})
     again = (await edit(client, "POST", "/import", table=table, dbh_unit="m")).json()
-    assert (again["added"], again["left_out"], again["undo"]) == (0, 2, 1)
+    assert (again["added"], again["left_out"], again["undo"]) == (0, 2, {"tree": 1})
     twice = table + "9.0,9.0,0.2,tree\n" * 2
     mixed = (await edit(client, "POST", "/import", table=twice, dbh_unit="m")).json()
     assert (mixed["added"], mixed["left_out"]) == (1, 3)

@@ -1,6 +1,6 @@
 // The tab Plots: draw, type, import and list plots, with the stand figures of each plot and of all.
 
-import { draft, redo, remove, reviewOf, rows as annotations, STATES, treeNumberOf, undo } from "../../annotate/annotations.js";
+import { draft, historyOf, remove, reviewOf, rows as annotations, STATES, treeNumberOf } from "../../annotate/annotations.js";
 import { get } from "../../core/api.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
 import { count, figure, percent, plusMinus, withSigma } from "../../core/format.js";
@@ -13,6 +13,7 @@ import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plo
 import { reportMenu } from "./report.js";
 
 const pause = () => (state.status?.state === "playing" ? 3000 : 300); // [ms] between two requests
+const { undo, redo, canUndo, canRedo } = historyOf("plot", "frame");
 const LARGEST_FILES = 700_000; // [bytes]
 // name, label, value and bounds of the numbers of a shape; those of the server
 const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],
@@ -96,7 +97,7 @@ function build() {
     el("div", { id: "plots-edit", "data-edits": true },
       el("div", { class: "annotate-head" }, el("span", { class: "dim", text: "Draw" }),
         ...Object.entries(SHAPES).map(([kind, text]) => button(`plot-${kind}`, text, `Draw a ${kind} on the map`, () => draw(kind))), el("span", { class: "grow" }),
-        button("plot-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("plot-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
+        button("plot-undo", "Undo", "Undo your last edit of plots or coordinates (Ctrl+Z)", undo), button("plot-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
       el("details", { class: "plot-more" }, el("summary", { text: "Type a plot, place plots along the path, or import a file" }), typed(), alongPath(), imported()),
       el("details", { id: "coordinates", class: "plot-more" })),
     el("p", { id: "plots-hint", class: "note dim", role: "status" }), el("p", { id: "plots-error", class: "error", role: "alert", hidden: true }),
@@ -242,8 +243,8 @@ function fill() {
   if (!plotting()) return;
   resetFields();
   for (const kind of Object.keys(SHAPES)) byId(`plot-${kind}`).setAttribute("aria-pressed", String(sketch.kind === kind));
-  byId("plot-undo").disabled = !draft.undo;
-  byId("plot-redo").disabled = !draft.redo;
+  byId("plot-undo").disabled = !canUndo();
+  byId("plot-redo").disabled = !canRedo();
   setText(byId("plots-hint"), hint());
   const problem = state.annotations?.problem || draft.error || (state.map ? figures.problem : "");
   byId("plots-error").hidden = !problem;
