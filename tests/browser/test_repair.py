@@ -195,11 +195,10 @@ def test_undo_of_a_tab_takes_back_nothing_of_another_tab(person: Dashboard):
     click(person, tree["x"], tree["y"])
     person.answer("y")
     person.until_server("/api/annotations", "it.trees.length === 1")
-    for tab, button in (("Repair", "#repair-undo"), ("Plots", "#plot-undo")):
-        person.tab(tab)
-        expect(page.locator(button)).to_be_disabled()
-        page.locator("#map").press("Control+z")
-    expect(page.locator("#plots-error")).to_contain_text("nothing to undo")
+    person.tab("Repair")
+    expect(page.locator("#repair-undo")).to_be_disabled()
+    page.locator("#map").press("Control+z")
+    expect(page.locator("#repair-error")).to_contain_text("nothing to undo")
     assert len(person.ask("/api/annotations")["trees"]) == 1
 
     person.tab("Repair")

@@ -205,7 +205,7 @@ const ARROWS = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP
 
 export const ANNOTATE_KEYS = [
   ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["shift P H B O", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
-  ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "in the tabs Annotate, Repair and Plots: undo and redo an edit of the tab"], ["shift+click", "in the 3D scene: add a tree there"],
+  ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "undo and redo an edit of the tab that is open"], ["shift+click", "in the 3D scene: add a tree there"],
 ];
 
 // Returns whether the key belonged to the tab.
