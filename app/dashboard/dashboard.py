@@ -57,6 +57,7 @@ class Dashboard:
 
     Attributes:
         status: Newest status of the worker.
+        recordings: Paths of the files to which live runs were to be recorded so far.
         shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
         seen: Views of the observed area.
         leaving: Coroutine functions that are called when the run is left, and at the end.
@@ -91,6 +92,7 @@ class Dashboard:
         self.camera = CameraView(self.worker_client)
         self.selector = Selector(self)
         self.source = SourceRequest("")
+        self.recordings: list[str] = []
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.loop = LoopPlayback(self)
@@ -137,7 +139,7 @@ class Dashboard:
         await self.sets.load()
         self.live.publish("view", self.scene.view)
         self._opens += 1
-        await self._leave_for(source.request())
+        await self._leave_for(source)
         await self.worker.start(self.receive)
 
     async def close(self) -> None:
@@ -207,19 +209,21 @@ class Dashboard:
             self.parameters.take(request.preset, request.parameters)
             self._show_parameters()  # the worker receives them when the source is open
         command = msgspec.structs.replace(_open_command(request), preset="", parameters={})
-        source = command.request()
         self._opens += 1
         number = self._opens
         async with self._opening:
             if number == self._opens:  # else another source was requested meanwhile
-                await self._leave_for(source)
+                await self._leave_for(command)
                 await self.command(command)
 
-    async def _leave_for(self, source: SourceRequest) -> None:
-        """Close the run: end its record and what works on it, and remove it from the page. From now on,
-        `source` is the source that is expected to open. The worker gets no command."""
+    async def _leave_for(self, command: protocol.Open) -> None:
+        """Close the run: end its record and what works on it, and remove it from the page. From now on, the
+        source of `command` is expected to open. The worker gets no command."""
+        source = command.request()
         self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self.run, self.source, self.digest = None, source, ""
+        if command.record:
+            self.recordings.append(command.record)
         self.live.publish("source", source.for_page())
         self.camera.forget()
         self.run_recorder.leave()

@@ -461,7 +461,11 @@ class LiveSource:
         there = any(p.topic == scan and p.msgtype in SCAN_TYPES for p in publishers)
         if there != self._there:
             if self._there is not None:
-                self._notices.append(f"{self._name()} is back" if there else f"{self._name()} is lost")
+                self._notices.append(
+                    f"{self._name()} sends scans again"
+                    if there
+                    else f"{self._name()} sends no scans any more"
+                )
             self._there = there
 
     def _choose(self) -> None:

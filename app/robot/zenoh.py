@@ -153,7 +153,10 @@ class ZenohLink(Link):
 
     def failure(self, error: Exception) -> str:
         """Return the reason why there is no connection."""
-        return f"no connection to {self._address.endpoint}: {first_line(error)}"
+        why = first_line(error)
+        if "Unable to connect" in why:  # it lists the addresses that were tried
+            why = "no Zenoh router answers there. Is it running, is the address right, and is the network up?"
+        return f"no connection to {self._address.endpoint}: {why}"
 
     def _connect(self) -> None:
         """Open the session, and subscribe to announcements and to all channels; raises the errors of

@@ -129,7 +129,8 @@ def serve(
     source: Open,
     parameter_state: ParameterState,
 ) -> int:
-    """Serve the dashboard until SIGINT or SIGTERM; return the exit code, see `run_server`.
+    """Serve the dashboard until SIGINT or SIGTERM, and print which live runs were recorded; return the exit
+    code, see `run_server`.
 
     Args:
         settings: Settings of the deployment.
@@ -141,12 +142,15 @@ def serve(
         SystemExit: The dashboard fails at its start.
     """
 
+    recordings: list[str] = []
+
     async def make_app(port: int, tokens: AccessTokens) -> ASGIApp:
+        nonlocal recordings
         worker = WorkerProcess()
         await worker.spawn()  # first: it imports its modules while this process imports those of the page
         from app.web.app import build
 
-        return build(
+        app = build(
             settings,
             port=port,
             tokens=tokens,
@@ -154,8 +158,15 @@ def serve(
             parameter_state=parameter_state,
             make_worker=lambda: worker,
         )
+        recordings = app.state.dashboard.recordings
+        return app
 
-    return run_server(settings, make_app)
+    try:
+        return run_server(settings, make_app)
+    finally:  # a signal ends the server by an exception
+        for path in recordings:
+            if Path(path).is_file():  # without a message there is none
+                print(f"Recording: {path}", flush=True)  # noqa: T201
 
 
 def run_server(settings: Settings, make_app: Callable[[int, AccessTokens], Awaitable[ASGIApp]]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -437,6 +437,10 @@ class LiveRecording(MessageSource):
         recorded, skipped = sum(scans.values()), sum(len(self._skipped.get(c, ())) for c in scans)
         first_ns = next((m.log_ns for m in self._messages(list(scans), {})), 0)
         last_ns = max((m.log_ns for m in self._container.last(scans)), default=first_ns)
+        messages = Counter[str]()
+        for channel in self._container.channels:
+            messages[channel.topic] += channel.count
+        topics = (replace(topic, messages=messages[topic.name]) for topic in known.topics)
         revisions, warnings = tuple(self._notes(PARAMETERS, Revision)), list(known.warnings)
         if self._container.damage:
             warnings.append("the recording is cut or damaged: only whole messages are read")
@@ -455,7 +459,7 @@ class LiveRecording(MessageSource):
             preset=self._run.preset,
             warnings=tuple(warnings),
             revisions=revisions,
-            topics=(*known.topics, *camera_topics(self._camera_channels)),
+            topics=(*topics, *camera_topics(self._camera_channels)),
         )
 
     def _messages(self, numbers: Collection[int], losses: dict[str, int]) -> Iterator[Message]:

@@ -1,7 +1,7 @@
 // Letter, colour and explanation of each verdict.
 
 const VERDICTS = {
-  tree: ["T", "tree", "A stem: it is used by SLAM and the map."],
+  tree: ["T", "tree", "A stem in this scan: SLAM uses it. Whether it is a tree of the map is decided by all scans that saw it."],
   pole: ["P", "pole", "A thin straight object."],
   person: ["H", "person", "A person."],
   bush: ["B", "bush", "Scattered points without a stem."],

@@ -58,7 +58,7 @@ const panels = () => [
   ...(state.annotations?.own == null ? [] : AGAINST.map(([value, words]) => [`Score against ${words}`, "", edits(() => { toTab("scores")(); scoreAgainst(value); })])),
   ["Upload a recording", "", edits(async () => { await openSources(); byId("upload-choose").focus(); })],
   ["Connect a robot or a sensor", "", edits(connectRobot)],
-  ...(isRecording() ? [["End the recording; the run goes on", "", endRecording]] : []),
+  ...(isRecording() ? [["End the recording; the run goes on", "", endRecording, "stop finish live"]] : []),
   ["Topics and mounting of a recording or robot", "", edits(async () => { await openSources(); byId("source-uri").value ||= state.status?.source ?? ""; byId("source-inside").open = true; })],
   ...(byId("warnings-button").hidden ? [] : [["Show the warnings", "", () => byId("warnings-button").click()]]),
 ];

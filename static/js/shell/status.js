@@ -153,7 +153,7 @@ function showState() {
   box.classList.toggle("going", state.connected && isGoing(state.status));
   setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.refused ? "No access" : state.lostAt ? "No connection" : "Connecting");
   box.title = [box.querySelector("b").textContent, robotsTitle(state.status)].filter(Boolean).join("\n"); // a long name is cut
-  showRecording(state.status?.recording ?? "");
+  showRecording(state.status?.recording ?? "", state.connected);
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
   const quiet = isOld();
   byId("figures").classList.toggle("old", quiet);
@@ -162,14 +162,14 @@ function showState() {
 }
 
 // The file and its size, or why there is none; a press on a recording ends it.
-function showRecording(recording) {
-  const box = byId("recording"), isOn = recording.startsWith("recording");
+function showRecording(recording, isConnected) {
+  const box = byId("recording"), isOn = isConnected && recording.startsWith("recording");
   box.hidden = !recording;
   box.disabled = !isOn || looksOnly();
   box.classList.toggle("bad", recording.startsWith("not"));
   const [word] = recording.split(/[ :]/), size = recording.split(", ").find((part) => part.endsWith(" MB")) ?? "";
-  setText(box, recording.startsWith("not") ? `⚠ ${recording.split(":")[0]}` : `${isOn ? "●" : "■"} ${word} ${size}`);
-  box.title = isOn ? `${recording}; press to end the recording, while the run goes on` : recording;
+  setText(box, !isConnected && recording.startsWith("recording") ? "? recording: not known" : recording.startsWith("not") ? `⚠ ${recording.split(":")[0]}` : `${isOn ? "●" : "■"} ${word} ${size}`);
+  box.title = !isConnected ? `Before the connection was lost: ${recording}` : isOn ? `${recording}; press to end the recording, while the run goes on` : recording;
 }
 
 export const isRecording = () => (state.status?.recording ?? "").startsWith("recording");

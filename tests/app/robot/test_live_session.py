@@ -159,9 +159,9 @@ def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
         link.silence_s, link.there, link.version = 7.0, [], 5
         until(lambda: on.status.state == "waiting")
         until(lambda: on.status.detail.startswith("Nothing heard for 7 s: robot robot1 is gone"))
-        until(lambda: "robot robot1 is lost" in on.status.warnings)
+        until(lambda: "robot robot1 sends no scans any more" in on.status.warnings)
         announce(link, sending)
-        until(lambda: "robot robot1 is back" in on.status.warnings)
+        until(lambda: "robot robot1 sends scans again" in on.status.warnings)
         sending(link, 10, 11)  # once more
         sending(link, 11, SCANS)
         until(lambda: on.shown[-1] == SCANS - 1 and on.status.state == "playing")
@@ -169,7 +169,9 @@ def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
         assert counts is not None
         assert counts.losses["scans lost on the way"] == 2
         assert counts.losses["scans that were not later than the one before"] == 1
-        assert {"robot robot1 is lost", "robot robot1 is back"} < set(counts.warnings)
+        assert {"robot robot1 sends no scans any more", "robot robot1 sends scans again"} < set(
+            counts.warnings
+        )
         assert on.shown == sorted(set(on.shown)), "each scan is shown once"
 
 

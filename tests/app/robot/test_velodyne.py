@@ -116,7 +116,7 @@ def test_a_sensor_is_heard_over_the_network_and_lost():
         assert all(isinstance(record, Scan) for record in scans)
         # A machine that is slow at its first packets drops sweeps, which are counted; nothing else is lost.
         assert source.losses.keys() - {SKIPPED} == {NO_DATA}
-        until(lambda: not source.take() and "the sensor is lost" in source.notices())
+        until(lambda: not source.take() and "the sensor sends no scans any more" in source.notices())
 
 
 def test_packets_of_another_sender_are_refused_and_counted():

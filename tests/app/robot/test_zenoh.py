@@ -56,11 +56,11 @@ def test_a_robot_is_found_heard_lost_and_found_again(router: int, robots: Callab
         assert {len(scan.points) for scan in records if isinstance(scan, Scan)} == {POINTS}
         assert any(isinstance(record, Odometry) for record in records)
         robot.kill()
-        until(lambda: not source.take() and "robot robot1 is lost" in source.notices())
+        until(lambda: not source.take() and "robot robot1 sends no scans any more" in source.notices())
         assert source.robots == []
         until(lambda: "robot robot1 is gone" in source.waiting_for())
         again = robots("robot1")
-        until(lambda: not source.take() and "robot robot1 is back" in source.notices())
+        until(lambda: not source.take() and "robot robot1 sends scans again" in source.notices())
         again.send()
         heard = sum(isinstance(record, Scan) for record in records)
         taken(source, records, heard + SCANS // 2)

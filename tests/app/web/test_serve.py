@@ -26,6 +26,7 @@ from app.web.serving import bind
 from pipeline.errors import StemmapError
 from pipeline.io.readers import open_source
 from pipeline.io.recording.mcap_writer import write_recording
+from tests.app.robot.test_velodyne import turn
 
 ROOT = Path(__file__).resolve().parents[3]
 LINK = re.compile(r"stemmap is ready: (http://127\.0\.0\.1:(\d+)/)\?token=(\S+)")
@@ -171,6 +172,28 @@ async def test_a_signal_ends_server_and_worker_without_output(number: signal.Sig
         assert errors.decode() == ""
         assert len(workers) == 1
         assert not runs(workers[0])
+
+
+async def test_the_recording_is_named_at_the_end(tmp_path: Path) -> None:
+    file = tmp_path / "run.pcap"
+    with socket.socket(type=socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        port = sender.getsockname()[1]
+    async with (
+        serving(f"velodyne:127.0.0.1:{port}", "--record", str(file)) as server,
+        server.browser(),
+    ):
+        with socket.socket(type=socket.SOCK_DGRAM) as sender:
+            async with asyncio.timeout(60):
+                while not file.is_file() or not file.stat().st_size:
+                    for packet in turn():
+                        sender.sendto(packet, ("127.0.0.1", port))
+                    await asyncio.sleep(0.1)
+        server.process.send_signal(signal.SIGINT)
+        async with asyncio.timeout(20):
+            output, errors = await server.process.communicate()
+        assert errors.decode() == ""
+        assert output.decode().endswith(f"Recording: {file}\n")
 
 
 async def test_a_browser_that_never_reads_leaves_no_traceback_at_the_end() -> None:

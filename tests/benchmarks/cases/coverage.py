@@ -127,14 +127,11 @@ def _driven_on(first: SimulatedRun, corners: Float | None, length: float) -> Sim
         on = np.linspace(0.0, legs[-1], max(2, round(legs[-1] / SPACING)) + 1)[1:]
         way = np.column_stack([np.interp(on, legs, column) for column in corners.T])
         course = lay_course(np.concatenate([begun, way]), closed=False)
-        c, s = np.cos(course.heading), np.sin(course.heading)  # back into the frame of the scene
-        course = replace(
-            course,
-            x=c * course.x - s * course.y,
-            y=s * course.x + c * course.y,
-            yaw=course.yaw + course.heading,
-        )
     drive = drive_course(course, scenario.speed, request.duration_s + 10.0 * length / scenario.speed)
+    if corners is not None:  # back into the frame of the scene
+        c, s = np.cos(course.heading), np.sin(course.heading)
+        x, y = c * drive.x - s * drive.y, s * drive.x + c * drive.y
+        drive = replace(drive, x=x, y=y, yaw=drive.yaw + course.heading)
     driven_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(drive.x), np.diff(drive.y)))])
     end = int(np.searchsorted(driven_m, min(total_m, driven_m[-1] - 0.1)))
     longer = replace(request, duration_s=float(drive.t[end]))

@@ -134,9 +134,9 @@ def test_a_robot_of_fast_dds_is_found_heard_lost_and_found_again(fast_dds: Path,
             until(lambda: source._link.scans == SCANS, lambda: str(source._link.scans))
             assert source.losses == {}
         robot.withdraw(topic)
-        until(lambda: not source.take() and "the robot is lost" in source.notices())
+        until(lambda: not source.take() and "the robot sends no scans any more" in source.notices())
         robot.announce(reliable=not reliable, topics=(topic,))  # another quality of service than before
-        until(lambda: not source.take() and "the robot is back" in source.notices())
+        until(lambda: not source.take() and "the robot sends scans again" in source.notices())
         heard = len(_scans(records))
         robot.matched(topic)
         robot.send(100_000)
