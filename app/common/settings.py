@@ -55,18 +55,20 @@ class RunBudget(NamedTuple):
 
     @property
     def scans(self) -> int:
-        """Share of the files for the scans of the source."""
-        return self.files // 2
+        """Share of the files for the scans of the source; of 2 GB, for the last six minutes of a VLP-16."""
+        return 7 * self.files // 16
 
     @property
     def results(self) -> int:
-        """Share of the files for the results of one map; a sixteenth is left to states of the mapper."""
-        return self.files // 16
+        """Share of the files for the results of one map; of 2 GB, for more than ten minutes. A sixteenth of
+        the files is left to states of the mapper."""
+        return self.files // 18
 
     @property
     def segmented(self) -> int:
-        """Share of the files for the scans that are segmented with one set of parameters."""
-        return self.files // 12
+        """Share of the files for the scans that are segmented with one set of parameters; of 2 GB, for more
+        than ten minutes."""
+        return self.files // 9
 
     @property
     def tree_log(self) -> int:
