@@ -429,17 +429,20 @@ def _standing_twice(place: Float, dbh: Float) -> list[str]:
     pairs = cKDTree(place).query_pairs(SHIFT_MAX, output_type="ndarray")
     unlike = np.abs(dbh[pairs[:, 0]] - dbh[pairs[:, 1]]) > SAME_DBH  # False where one is unknown
     pairs = pairs[~unlike]
-    shift = place[pairs[:, 1]] - place[pairs[:, 0]]
-    shift *= np.where(shift[:, :1] < 0.0, -1.0, 1.0)
-    alike = np.hypot(*(shift[:, None] - shift[None]).T) < SHIFT_SIGMA
     n = len(pairs)
-    most = alike[alike.sum(axis=1).argmax()] if n else np.zeros(0, np.bool_)
-    chance = n * bdtrc(most.sum() - 2.0, n - 1, 2.0 * (SHIFT_SIGMA / SHIFT_MAX) ** 2) if n else 1.0
-    if most.sum() < FEWEST_PAIRS or len(np.unique(pairs[most])) < 2 * most.sum() or chance > BY_CHANCE:
+    if n < FEWEST_PAIRS:
         return []
-    x, y = np.median(shift[most], axis=0).tolist()
+    shift = place[pairs[:, 1]] - place[pairs[:, 0]]
+    both = np.concatenate([shift, -shift])  # the stems of a pair have no order
+    shifts = cKDTree(both)
+    fullest = int(shifts.query_ball_point(shift, SHIFT_SIGMA, return_length=True).argmax())
+    most = np.array(shifts.query_ball_point(shift[fullest], SHIFT_SIGMA))
+    chance = n * bdtrc(len(most) - 2.0, n - 1, 2.0 * (SHIFT_SIGMA / SHIFT_MAX) ** 2)
+    if len(most) < FEWEST_PAIRS or len(np.unique(pairs[most % n])) < 2 * len(most) or chance > BY_CHANCE:
+        return []
+    x, y = np.median(both[most], axis=0).tolist()
     return [
-        f"{TWICE}: {most.sum()} pairs are {x:.2f}, {y:.2f} m apart, so two passes of the scanner do not fit; "
+        f"{TWICE}: {len(most)} pairs are {x:.2f}, {y:.2f} m apart, so two passes of the scanner do not fit; "
         "register them anew"
     ]
 
