@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -15,8 +16,8 @@ from app.batch.run_edits import SAME_THING
 from app.store.async_store import AsyncStore
 from app.store.records import FRAME, KINDS, REPAIR, SKIPPED, Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError
-from pipeline.repairs.record import Repair, identity_of
-from pipeline.types.records import TruthTrees
+from pipeline.repairs.record import Repair, identity_of, numbers_at
+from pipeline.types.records import Trees, TruthTrees
 
 if TYPE_CHECKING:
     from app.store.store import Store
@@ -311,6 +312,28 @@ class AnnotationEditor:
             "repairs": identity_of(self.repairs),
             "frame": None if self.frame is None else values_payload(self.frame),
         }
+
+
+def moved_with_trees(
+    trees: Trees, rows: Sequence[Annotation], moves: Sequence[tuple[tuple[float, float], tuple[float, float]]]
+) -> list[tuple[int, int, Content | None]]:
+    """Return the changes of the annotations of trees that are moved, by as much as their trees: id, version
+    and new content of each, see `Store.edit`.
+
+    Args:
+        trees: The trees before they are moved.
+        rows: The annotations of objects and skipped trees.
+        moves: Position of each moved tree before and after [m].
+    """
+    changes: list[tuple[int, int, Content | None]] = []
+    number_of = {row.id: numbers_at(trees, [(row.content.x, row.content.y)], confirmed=True) for row in rows}
+    for start, end in moves:
+        number = numbers_at(trees, [start], confirmed=True)
+        for row in rows if number else ():
+            if number_of[row.id] == number:
+                x, y = row.content.x + end[0] - start[0], row.content.y + end[1] - start[1]
+                changes.append((row.id, row.version, replace(row.content, x=x, y=y)))
+    return changes
 
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:

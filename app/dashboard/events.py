@@ -24,7 +24,7 @@ class Event:
 
     Attributes:
         time_s: Time since the first scan of the run [s].
-        kind: Tree confirmed, warning, parameters changed, pose quality changed, or annotation.
+        kind: Tree mapped, warning, parameters changed, pose quality changed, or annotation.
         text: Description for people.
     """
 
@@ -77,7 +77,7 @@ class Events:
         confirmed = set(frame.trees.number[frame.trees.confirmed].tolist())
         at = {} if confirmed_s is None else self._times(frame, confirmed_s)
         for number in sorted(confirmed - self._confirmed):
-            self._note(f"tree {number}", Event(at.get(number, time_s), "tree", f"Tree {number} confirmed"))
+            self._note(f"tree {number}", Event(at.get(number, time_s), "tree", f"Tree {number} mapped"))
         self._confirmed |= confirmed
         health = frame.health
         if health.state != self._health:
@@ -99,7 +99,7 @@ class Events:
         self._confirmed = {number for number, _ in confirmed}
         self._health = "good"
         for number, at in confirmed:
-            self._note(f"tree {number}", Event(at, "tree", f"Tree {number} confirmed"))
+            self._note(f"tree {number}", Event(at, "tree", f"Tree {number} mapped"))
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
         """Add events for warnings that were not active in the last call; return whether there are any.

@@ -64,8 +64,11 @@ def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:
     """Return the trees without the rows `others`, each merged into a row of `into`, shape (M,); no row is in
     both, or twice.
 
-    Position, diameter and height are means weighted by the inverse variances, the eccentricity and the lean
-    by the observations. Observations are added, and the sides that were observed are joined.
+    The position is the mean weighted by the inverse variances; diameter and height are means as by
+    `_consensus`; eccentricity and lean are means weighted by the observations. The sides that were observed
+    are joined. The observations are those of the union of the scans: their sum if one tree was last seen
+    before the other one was first seen. Otherwise it is not known which scans detected both, and the larger
+    number is taken, which the union has at least.
     """
     if not len(into):
         return trees
@@ -78,9 +81,11 @@ def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:
         np.linalg.solve(a.covariance, a.position[:, :, None])[:, :, 0]
         + np.linalg.solve(b.covariance, b.position[:, :, None])[:, :, 0],
     )
-    dbh, dbh_sigma = _weighted(a.dbh, a.dbh_sigma, b.dbh, b.dbh_sigma)
-    observed = a.observations + b.observations
-    share = a.observations / np.maximum(observed, 1)
+    dbh, dbh_sigma = _consensus(a.dbh, a.dbh_sigma, b.dbh, b.dbh_sigma)
+    both = a.observations + b.observations
+    is_apart = (a.last_seen_ns < b.first_seen_ns) | (b.last_seen_ns < a.first_seen_ns)
+    observed = np.where(is_apart, both, np.maximum(a.observations, b.observations))
+    share = a.observations / np.maximum(both, 1)
     coverage, sides = np.maximum(a.coverage, b.coverage), None
     if a.sides is not None and b.sides is not None:
         sides = a.sides | b.sides
@@ -100,7 +105,7 @@ def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:
     }
     if a.height is not None and b.height is not None and a.height_sigma is not None:
         assert b.height_sigma is not None  # noqa: S101 - both are of one table
-        height = _weighted(a.height, a.height_sigma, b.height, b.height_sigma)
+        height = _consensus(a.height, a.height_sigma, b.height, b.height_sigma)
         columns |= {"height": height[0], "height_sigma": height[1]}
     if a.lean is not None and b.lean is not None:
         columns["lean"] = _mean(a.lean, b.lean, share)
@@ -125,11 +130,20 @@ def _split(trees: Trees, row: int, place: Float, number: int) -> Trees:
     return replace(table, number=numbers, position=position, dbh=dbh, dbh_sigma=dbh_sigma)
 
 
-def _weighted(a: Float, sigma_a: Float, b: Float, sigma_b: Float) -> tuple[Float, Float]:
-    """Return means weighted by the inverse variances, and their standard deviations; where one value is NaN,
-    the other one."""
-    weight_a = np.where(np.isfinite(a) & (sigma_a > 0.0), sigma_a**-2.0, 0.0)
-    weight_b = np.where(np.isfinite(b) & (sigma_b > 0.0), sigma_b**-2.0, 0.0)
+def _consensus(a: Float, sigma_a: Float, b: Float, sigma_b: Float) -> tuple[Float, Float]:
+    """Return consensus means of two measurements, and their standard deviations; where one value is NaN, the
+    other one.
+
+    Values that differ by more than their standard deviations explain have a further variance tau^2 each, such
+    that (a - b)^2 = sigma_a^2 + sigma_b^2 + 2 tau^2 (Paule and Mandel, Journal of Research of the National
+    Bureau of Standards 87, 1982). Far apart, the mean is then (a + b) / 2 with the standard deviation
+    |a - b| / 2, which covers both.
+    """
+    gap, known_a, known_b = a - b, np.isfinite(a) & (sigma_a > 0.0), np.isfinite(b) & (sigma_b > 0.0)
+    further = np.maximum(0.5 * (gap**2 - sigma_a**2 - sigma_b**2), 0.0)
+    further = np.where(known_a & known_b, further, 0.0)
+    weight_a = np.where(known_a, 1.0 / (sigma_a**2 + further), 0.0)
+    weight_b = np.where(known_b, 1.0 / (sigma_b**2 + further), 0.0)
     total = weight_a + weight_b
     known = total > 0.0
     safe = np.where(known, total, 1.0)

@@ -16,7 +16,7 @@ def test_a_mark_seeks_to_its_event_and_a_loop_is_repeated(dashboard: Dashboard):
     dashboard.stand(12.05)
     confirmed = page.locator("#marks .mark.tree")
     expect(confirmed.first).to_be_attached()
-    expect(confirmed.first).to_have_attribute("title", re.compile(r"Tree \d+ confirmed"))
+    expect(confirmed.first).to_have_attribute("title", re.compile(r"Tree \d+ mapped"))
     page.evaluate(CHANGE)
     change = page.locator("#marks .mark.change[title*='clustering.eps'][title*='→ 0.2']").last
     expect(change).to_be_visible()

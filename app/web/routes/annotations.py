@@ -8,18 +8,20 @@ import re
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
+import msgspec
 from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
 from app.dashboard.annotations import Against, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.store.records import MOST_ANNOTATIONS, Content, contents_of, moment
+from app.store.records import MOST_ANNOTATIONS, REPAIR, Content, contents_of, moment
 from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
 from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
+from app.web.routes.repairs import displaced
 from pipeline.errors import SourceError
-from pipeline.repairs.record import numbers_at
+from pipeline.repairs.record import Repair, numbers_at
 
 router = APIRouter(prefix="/api")
 
@@ -96,9 +98,13 @@ async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Re
 
 @router.delete("/annotations/{number}")
 async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
-    """Delete an annotation; 409 if it does not have this version any more or another run was opened, 404 for
-    an unknown one. Return its number (`id`) and the counts of edits, see `edited`."""
-    await apply_edit(dashboard, body, Store.change, number, body.version, None)
+    """Delete an annotation; with the repair that moved a tree, its annotations move back. 409 if it does not
+    have this version any more or another run was opened, 404 for an unknown one. Return its number (`id`) and
+    the counts of edits, see `edited`."""
+    rows = [row for row in dashboard.annotation_editor.others if row.id == number]
+    repairs = [msgspec.convert(row.content.values, Repair) for row in rows if row.content.kind == REPAIR]
+    changed = [(number, body.version, None), *displaced(dashboard, repairs, back=True)]
+    await apply_edit(dashboard, body, Store.edit, [], changed)
     return await edited(dashboard, body, {"id": number})
 
 

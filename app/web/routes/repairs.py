@@ -5,6 +5,7 @@ They are annotations of the class REPAIR: deletion, undo and redo are routes of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -12,6 +13,7 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
+from app.dashboard.annotations import moved_with_trees
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.selection import NothingMappedError
 from app.store.records import REPAIR, Content
@@ -42,12 +44,14 @@ class _ImportRepairs(Edit):
 
 @router.post("/repairs")
 async def add(body: _AddRepair, dashboard: Dash) -> Response:
-    """Add a repair; return its number (`id`) and the counts of edits, see `edited`, with 201. 409 before the
-    first map or if another run was opened meanwhile, 422 for a repair that is not valid, and for a tie of a
-    position without a tree."""
+    """Add a repair; the annotations of a moved tree move with it. Return its number (`id`) and the counts of
+    edits, see `edited`, with 201. 409 before the first map or if another run was opened meanwhile, 422 for a
+    repair that is not valid, and for a tie of a position without a tree."""
     if len(dashboard.annotation_editor.repairs) >= MOST:
         raise BadRequestError(f"a run can have at most {MOST} repairs")
-    (added,) = await apply_edit(dashboard, body, Store.add, [_content(_repair(body, dashboard))])
+    repair = _repair(body, dashboard)
+    moved = displaced(dashboard, [repair])
+    (added,) = await apply_edit(dashboard, body, Store.edit, [_content(repair)], moved)
     return await edited(dashboard, body, {"id": added}, 201)
 
 
@@ -61,7 +65,8 @@ async def import_file(body: _ImportRepairs, dashboard: Dash) -> Response:
         if len(known) + len(new) > MOST:
             raise BadRequestError(f"a run can have at most {MOST} repairs")
     if new:
-        await apply_edit(dashboard, body, Store.add, [_content(repair) for repair in new])
+        moved = displaced(dashboard, new)
+        await apply_edit(dashboard, body, Store.edit, [_content(repair) for repair in new], moved)
     return await edited(dashboard, body, {"added": len(new)})
 
 
@@ -96,6 +101,25 @@ def _repair(body: _AddRepair, dashboard: Dashboard) -> Repair:
     if repair.problem:
         raise BadRequestError(repair.problem)
     return repair
+
+
+def displaced(
+    dashboard: Dashboard, repairs: Sequence[Repair], *, back: bool = False
+) -> list[tuple[int, int, Content | None]]:
+    """Return the changes of the annotations of the trees that repairs move, see `moved_with_trees`; none
+    without a map.
+
+    Args:
+        dashboard: The dashboard.
+        repairs: Repairs of any kind.
+        back: Whether the repairs are removed.
+    """
+    if dashboard.shown is None:
+        return []
+    pairs = [repair.places for repair in repairs if repair.kind == "move"]
+    moves = [(end, start) if back else (start, end) for start, end in pairs]
+    editor = dashboard.annotation_editor
+    return moved_with_trees(dashboard.shown.frame.trees, [*editor.rows, *editor.skipped], moves)
 
 
 def _content(repair: Repair) -> Content:

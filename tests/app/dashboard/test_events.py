@@ -31,7 +31,7 @@ def test_a_tree_is_marked_where_it_was_confirmed_first():
     assert not events.shown(seen(1, 1), 0.1)
     assert events.shown(seen(2, 2), 0.2)
     assert not events.shown(seen(1, 2), 0.1)  # the run went back
-    assert marks(events) == [(0.0, "tree", "Tree 1 confirmed"), (0.2, "tree", "Tree 2 confirmed")]
+    assert marks(events) == [(0.0, "tree", "Tree 1 mapped"), (0.2, "tree", "Tree 2 mapped")]
 
 
 def test_health_is_marked_when_it_changes_and_a_warning_when_it_is_new():
@@ -55,7 +55,7 @@ def test_a_slider_that_moves_is_one_change_and_one_that_came_back_is_none():
     events.shown(seen(9, 2), 0.9)
     events.changed({"a": 1, "b": 2}, {"a": 1.5, "b": 2}, 0.5)
     events.changed({"a": 1.5, "b": 2}, {"a": 2, "b": 2}, 0.5)
-    assert marks(events) == [(0.0, "tree", "Tree 1 confirmed"), (0.5, "change", "a: 1 → 2")]
+    assert marks(events) == [(0.0, "tree", "Tree 1 mapped"), (0.5, "change", "a: 1 → 2")]
     events.changed({"a": 2, "b": 2}, {"a": 1, "b": 2}, 0.5)
     assert [kind for _, kind, _ in marks(events)] == ["tree"]
 
@@ -65,13 +65,13 @@ def test_after_a_rerun_the_marks_of_the_part_that_is_still_to_come_stay_until_it
     for index, trees in [(0, 1), (9, 2), (20, 3)]:
         events.shown(seen(index, trees), 0.1 * index)
     events.changed({"a": 1}, {"a": 2}, 0.5)  # the run had gone back
-    later = [(0.9, "tree", "Tree 2 confirmed"), (2.0, "tree", "Tree 3 confirmed")]
+    later = [(0.9, "tree", "Tree 2 mapped"), (2.0, "tree", "Tree 3 mapped")]
     assert marks(events, before=True) == later
     events.remapped([(1, 0.2)], 0.5)
-    now = [(0.2, "tree", "Tree 1 confirmed"), (0.5, "change", "a: 1 → 2")]
+    now = [(0.2, "tree", "Tree 1 mapped"), (0.5, "change", "a: 1 → 2")]
     assert (marks(events), marks(events, before=True)) == (now, later)
     assert events.shown(seen(12, 2), 1.2)
-    assert marks(events) == [*now, (1.2, "tree", "Tree 2 confirmed")]
+    assert marks(events) == [*now, (1.2, "tree", "Tree 2 mapped")]
     assert marks(events, before=True) == later[1:]
     assert events.shown(seen(20, 2), 2.0)  # a mark that is none any more
     assert marks(events, before=True) == []
@@ -80,7 +80,7 @@ def test_after_a_rerun_the_marks_of_the_part_that_is_still_to_come_stay_until_it
 def test_what_was_passed_over_is_marked_where_it_was_and_not_where_it_was_shown():
     events = Events()
     events.shown(seen(30, 2), 3.0, np.array([0.4, np.nan]))
-    assert marks(events) == [(0.4, "tree", "Tree 1 confirmed"), (3.0, "tree", "Tree 2 confirmed")]
+    assert marks(events) == [(0.4, "tree", "Tree 1 mapped"), (3.0, "tree", "Tree 2 mapped")]
 
 
 def test_edits_at_one_time_are_one_mark_that_counts_them_and_stay_when_parameters_change():

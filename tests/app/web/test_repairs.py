@@ -48,6 +48,27 @@ async def test_repairs_are_stored_sent_in_their_order_and_undone() -> None:
         await until(lambda: [each.kind for each in sent(dashboard.worker)] == ["class"])
 
 
+async def test_the_annotation_of_a_moved_tree_moves_with_it_and_back() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        (x, y), (other, _) = dashboard.shown.frame.trees.position[:2].tolist()  # type: ignore[union-attr]
+        for at, kind in ((x + 0.1, "tree"), (other, "skipped")):
+            await edit(client, "POST", x=at, y=y if kind == "tree" else _, kind=kind, dbh_cm=30.0)
+
+        async def trees() -> list[tuple[float, float | None]]:
+            rows = (await client.get("/api/annotations")).json()["trees"]
+            return [(round(row["x"] - x, 3), row["dbh_cm"]) for row in rows]
+
+        assert (await repair(client, kind="move", places=[[x, y], [x + 2.5, y]])).status_code == 201
+        assert await trees() == [(2.6, 30.0)]
+        await edit(client, "POST", "/undo")
+        assert await trees() == [(0.1, 30.0)]
+        await edit(client, "POST", "/redo")
+        assert await trees() == [(2.6, 30.0)]
+        assert len((await client.get("/api/annotations")).json()["skipped"]) == 1
+
+
 async def test_a_tie_stores_the_times_at_which_its_trees_were_seen() -> None:
     async with running() as (client, dashboard):
         client.headers.update(BEARER)

@@ -190,7 +190,7 @@ async def test_a_run_that_was_mapped_again_has_its_own_marks_and_keeps_the_selec
     await dashboard.receive(Remapped(1, changes))
     assert dashboard.selector.selection.tree == 2
     marks = [e for e in dashboard.events.as_plain()["events"] if e["kind"] == "tree"]
-    assert [(e["t"], e["text"]) for e in marks] == [(0.1, "Tree 1 confirmed"), (0.2, "Tree 5 confirmed")]
+    assert [(e["t"], e["text"]) for e in marks] == [(0.1, "Tree 1 mapped"), (0.2, "Tree 5 mapped")]
     assert (await client.get("/api/trees")).status_code == 200
     gone = [TreeChange("vanished", 2, 0.0, 0.0, "now: nothing was detected there")]
     await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, changes=gone)))

@@ -35,7 +35,7 @@ def test_a_merged_tree_is_the_weighted_mean_of_both_and_keeps_the_first_number()
     of = replace(
         THREE,
         covariance=np.array([1.0, 4.0, 1.0])[:, None, None] * 1e-4 * np.eye(2),
-        dbh=np.array([0.3, 0.36, np.nan]),
+        dbh=np.array([0.3, 0.32, np.nan]),
         dbh_sigma=np.array([0.01, 0.02, np.nan]),
         sides=np.array([0b0011, 0b0110, 0]),
         height=np.array([20.0, np.nan, 18.0]),
@@ -46,9 +46,9 @@ def test_a_merged_tree_is_the_weighted_mean_of_both_and_keeps_the_first_number()
     found = repaired("merge", (0.1, 0.0), (5.1, 0.0), of=of)
     np.testing.assert_array_equal(found.number, [1, 3])
     np.testing.assert_allclose(found.position[0], [1.0, 0.0])  # the inverse variances are 4 to 1
-    assert found.dbh[0] == pytest.approx((4 * 0.3 + 0.36) / 5)
+    assert found.dbh[0] == pytest.approx((4 * 0.3 + 0.32) / 5)
     assert found.dbh_sigma[0] == pytest.approx(0.01 / np.sqrt(1.25))
-    assert found.observations[0] == 18
+    assert found.observations[0] == 9, "it is not known which scans detected both"
     assert found.sides is not None
     assert found.sides[0] == 0b0111
     assert (found.first_seen_ns[0], found.last_seen_ns[0]) == (3, 10**9)
@@ -57,6 +57,27 @@ def test_a_merged_tree_is_the_weighted_mean_of_both_and_keeps_the_first_number()
     assert found.lean is not None
     assert found.lean[0] == pytest.approx(0.15)
     np.testing.assert_array_equal(found.position[1], THREE.position[2])
+
+
+def test_a_merged_tree_has_no_more_scans_than_the_union_of_both():
+    times = {"first_seen_ns": np.array([0, 6, 0]), "last_seen_ns": np.array([5, 9, 9])}
+    apart = replace(THREE, observations=np.array([4, 3, 2]), **times)
+    assert repaired("merge", (0.0, 0.0), (5.0, 0.0), of=apart).observations[0] == 7, "no scan has both"
+    assert repaired("merge", (0.0, 0.0), (9.0, 1.0), of=apart).observations[0] == 4
+
+
+@pytest.mark.parametrize(("a", "b"), [((23.1, 1.3), (14.5, 1.1)), ((30.0, 0.2), (20.0, 3.0))])
+def test_the_mean_of_contradicting_diameters_covers_both(a: tuple[float, float], b: tuple[float, float]):
+    dbh, sigma = np.array([a, b, (np.nan, np.nan)]).T / 100.0
+    found = repaired("merge", (0.0, 0.0), (5.0, 0.0), of=replace(THREE, dbh=dbh, dbh_sigma=sigma))
+    away = np.abs(found.dbh[0] - dbh[:2])
+    further = 0.5 * ((dbh[0] - dbh[1]) ** 2 - np.square(sigma[:2]).sum())
+    assert found.dbh_sigma[0] == pytest.approx(np.sum(1.0 / (np.square(sigma[:2]) + further)) ** -0.5)
+    assert np.all(away < 1.3 * found.dbh_sigma[0])
+    # One that is consistent is not changed by the further variance: continuous at the limit.
+    near = np.array([0.2, 0.2 + np.hypot(*sigma[:2]), np.nan])
+    found = repaired("merge", (0.0, 0.0), (5.0, 0.0), of=replace(THREE, dbh=near, dbh_sigma=sigma))
+    assert found.dbh_sigma[0] == pytest.approx(np.sum(sigma[:2] ** -2.0) ** -0.5)
 
 
 def test_a_split_tree_is_two_without_diameters():
