@@ -131,10 +131,11 @@ export function openStory(kind) {
   byId("drawer-button").setAttribute("aria-expanded", "true");
 }
 
+// Who annotates or repairs stays in that tab after a click in the scene, as after one on the map.
 function onSelection() {
   if (performance.now() - clickedAt < CLICK && (state.selected !== null || state.selectedCluster)) {
     clickedAt = -CLICK;
-    openStory(state.selectedCluster ? "cluster" : "tree");
+    if (!["annotate", "repair"].some(visible)) openStory(state.selectedCluster ? "cluster" : "tree");
   }
   shown = "";
   show();

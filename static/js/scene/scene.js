@@ -24,7 +24,19 @@ function address() {
   return `/viser/?${query}`;
 }
 
+// viser's client takes the focus once when it starts, without a person's wish: it is given back, to the button of an open dialog
+// or where a person types.
+let takesFocus = false, focused = document.body;
+
+function giveFocusBack() {
+  if (!takesFocus || document.activeElement !== frame) return;
+  takesFocus = false;
+  frame.blur();
+  focused.focus({ preventScroll: true });
+}
+
 function load() {
+  takesFocus = true;
   frame.src = address();
 }
 
@@ -73,6 +85,9 @@ export function pressInScene(key) {
 }
 
 export function startScene() {
+  document.addEventListener("focusin", ({ target }) => { if (target !== frame) focused = target; });
+  addEventListener("blur", () => setTimeout(giveFocusBack)); // not within the call that takes it, which would have the last word
+  onScenePress(() => { takesFocus = false; });
   frame.addEventListener("load", () => {
     if (!frame.src || !frame.contentDocument) return;
     // It was loaded with the other theme, or reloads itself with its first address.
