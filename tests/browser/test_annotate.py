@@ -616,3 +616,52 @@ FIVE_TIMES_RIGHT = """canvas => {
     canvas.dispatchEvent(new KeyboardEvent('keydown', press));
   }
 }"""
+
+
+def test_picture_question_and_answers_are_in_view_together(person: Dashboard):
+    page = person.page
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    page.locator("#map").press("s")
+    person.card_shown()
+    parts = ["#review-evidence .picture:has(.fit)", "#annotate-hint", "#annotate-yes", "#annotate-no"]
+    parts += ["#annotate-next", "#annotate-kind", "#review-title"]
+    for width, height in ((1440, 900), (1280, 720), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        person.drawn()
+        page.evaluate("() => scrollTo(0, 0)")
+        top = page.locator("header.strip").bounding_box()
+        bottom = page.locator("footer.transport").bounding_box()
+        assert top is not None
+        assert bottom is not None
+        for part in parts:
+            box = page.locator(part).first.bounding_box()
+            assert box is not None, (width, part)
+            assert box["y"] >= top["y"] + top["height"] - 0.5, (width, part, box)
+            assert box["y"] + box["height"] <= bottom["y"] + 0.5, (width, part, box, bottom)
+            assert box["x"] >= 0, (width, part, box)
+            assert box["x"] + box["width"] <= width + 0.5, (width, part, box)
+
+
+def test_an_import_says_how_many_trees_of_the_map_it_confirms(person: Dashboard):
+    tree = person.ask("/api/trees")["trees"][0]
+    table = f"x_m,y_m,class\n{tree['x']},{tree['y']},tree\n500,500,tree\n"
+    person.page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    person.page.locator("#annotate-file").set_input_files(
+        {"name": "plot.csv", "mimeType": "text/csv", "buffer": table.encode()}
+    )
+    said = "2 trees imported from plot.csv; 1 tree of the map is confirmed by them"
+    expect(person.page.locator("#annotate-hint")).to_contain_text(said)
+    expect(person.page.locator("#annotate-confirmed")).to_have_text("1 confirmed")
+
+
+def test_the_map_names_the_filter_that_makes_it_pale_and_removes_it(person: Dashboard):
+    page, chip = person.page, person.page.locator("#map-filter")
+    expect(chip).to_be_hidden()
+    page.locator("#annotate-skipped").click()
+    expect(chip).to_have_text("Filter: skipped ✕")
+    person.tab("Repair")
+    chip.click()
+    expect(chip).to_be_hidden()
+    assert page.evaluate("() => import('/static/js/core/store.js').then(({ state }) => state.holds)") is None
+    person.tab("Trees")
+    expect(page.locator("#find")).to_have_value("")

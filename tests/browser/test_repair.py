@@ -214,3 +214,41 @@ def test_undo_of_a_tab_takes_back_nothing_of_another_tab(person: Dashboard):
     page.locator("#repair-undo").click()
     expect(page.locator("#repairs li")).to_have_count(0)
     assert [error for error in person.errors if "409" not in error] == []
+
+
+def test_a_moved_tree_stays_confirmed(person: Dashboard):
+    page, tree = person.page, apart(trees(person))[0]
+    person.tab("Annotate")
+    click(person, tree["x"], tree["y"])
+    person.answer("y")
+    expect(page.locator("#annotate-confirmed")).to_have_text("1 confirmed")
+    person.tab("Repair")
+    use(person, "move")
+    click(person, tree["x"], tree["y"])
+    click(person, tree["x"] + 2.0, tree["y"])
+    person.until_server("/api/annotations", f"it.trees[0].x > {tree['x'] + 1.5}")
+    person.until_server(
+        "/api/trees",
+        f"it.trees.some(tree => tree.number === {tree['number']} && tree.x > {tree['x'] + 1.5})",
+    )
+    person.tab("Annotate")
+    expect(page.locator("#annotate-confirmed")).to_have_text("1 confirmed")
+    person.tab("Repair")
+    page.locator("#repairs li button").first.click()
+    person.until_server("/api/annotations", f"Math.abs(it.trees[0].x - {tree['x']}) < 0.01")
+
+
+def test_a_merge_of_trees_with_contradicting_diameters_says_so(person: Dashboard):
+    page = person.page
+    known = [tree for tree in apart(trees(person)) if tree["dbh_cm"] is not None]
+    a, b = min(known, key=lambda tree: tree["dbh_cm"]), max(known, key=lambda tree: tree["dbh_cm"])
+    use(person, "merge")
+    click(person, a["x"], a["y"])
+    click(person, b["x"], b["y"])
+    expect(page.locator("#problem")).to_contain_text("have diameters that contradict each other (")
+    half = abs(a["dbh_cm"] - b["dbh_cm"]) / 2
+    person.until_server(
+        "/api/trees",
+        f"it.trees.some(tree => tree.number === {a['number']} && tree.sigma_dbh_cm > {0.8 * half})",
+    )
+    assert max(tree["observations"] for tree in trees(person)) <= person.ask("/api/status")["scan_index"] + 1

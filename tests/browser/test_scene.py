@@ -480,6 +480,28 @@ def test_a_shift_click_on_a_stem_in_the_scene_adds_it(dashboard: Dashboard):
     dashboard.until_server("/api/annotations", "it.trees.length === 0")
 
 
+@pytest.mark.usefixtures("large_scene")
+def test_a_click_on_a_stem_in_the_scene_stays_in_annotate(wide: Dashboard):
+    dashboard, page = wide, wide.page
+    dashboard.tab("Annotate")
+    page.locator("#map").press("t")
+    box = page.locator("#scene").bounding_box()
+    assert box is not None
+    numbers = [tree["number"] for tree in dashboard.ask("/api/trees")["trees"]]
+    places = dashboard.settled_places("/world/trees")
+    title = page.locator("#review-title")
+    for number, (x, y) in zip(numbers, places, strict=False):
+        if not (box["x"] + 20 < x < box["x"] + box["width"] - 360 and box["y"] + 60 < y < box["y"] + 600):
+            continue
+        dashboard.click_until(x, y, lambda: (title.text_content() or "").split(":")[0], f"Tree {number}")
+        page.wait_for_timeout(500)
+        expect(page.locator("#panel-annotate")).to_be_visible()
+        break
+    else:
+        pytest.fail("no tree was in sight")
+    page.locator("#map").press("Escape")
+
+
 # The rectangles of the labels that are drawn, and how many labels the server has sent.
 LABELS = """() => {
   const { scene } = window.__viserMutable, nodes = window.__viserSceneTree.getState();

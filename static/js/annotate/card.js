@@ -20,12 +20,19 @@ const stories = new Map(); // of each subject the newest story: {index of the sc
 
 const evidence = () => byId("review-evidence");
 
-// The card around `hint`, which is visible without a selected tree, too.
-export const card = (hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
-  el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" }),
-    button("review-story", "Story", "Why the mapping decided so, with the figures behind it", () => openTab("story"), "quiet small")),
+// The card: picture, question and answers side by side, so that all are in view at once. `answers` and `hint` are visible without
+// a selected tree, too.
+export const card = (answers, hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
+  el("div", { id: "review-evidence" }),
+  el("div", { class: "review-side" },
+    el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" }),
+      button("review-story", "Story", "Why the mapping decided so, with the figures behind it", () => openTab("story"), "quiet small")),
+    answers),
+  hint);
+
+// What else is known of the tree.
+export const moreEvidence = () => el("section", { id: "review-more", class: "review-more", "aria-label": "Further evidence on the tree" },
   el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
-  el("div", { id: "review-evidence" }), hint,
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
@@ -125,6 +132,7 @@ function requestPicture(number) {
 export function fillCard() {
   const tree = selectedTree();
   byId("review").classList.toggle("empty-card", !tree);
+  byId("review-more").hidden = !tree;
   if (!tree) {
     shown = "";
     pictured = draft.shown = null;
@@ -141,7 +149,7 @@ export function fillCard() {
   setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
   setText(byId("review-state"), review);
   byId("review-state").dataset.state = review;
-  byId("review").classList.toggle("loading", old);
+  for (const id of ["review", "review-more"]) byId(id).classList.toggle("loading", old);
   byId("review").setAttribute("aria-busy", String(old));
   fillDbh(tree);
   requestPicture(tree.number);

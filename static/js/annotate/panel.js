@@ -9,7 +9,7 @@ import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
 import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, remove, review, reviewHistory, reviewOf, rowOf, rows, sayHeld, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
-import { card, fillCard, startCard } from "./card.js";
+import { card, fillCard, moreEvidence, startCard } from "./card.js";
 import { startSection } from "./section.js";
 
 const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
@@ -33,23 +33,24 @@ function build() {
   } });
   const asked = el("div", { id: "annotate-ask", class: "annotate-ask", hidden: Boolean(givenName()) }, el("label", {}, "Your name, stored with each answer ", nameField("annotate-asked")),
     button("annotate-nameless", "Not now", "Answers are stored under the name of this browser", () => { asked.hidden = true; }, "quiet small"));
+  const answers = el("div", { class: "review-buttons", role: "group", "aria-label": "Is the selected found tree a tree?" },
+    button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree"), ""),
+    button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class beside it (N)", () => review(draft.kind), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
+    button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, ""));
   byId("panel-annotate").replaceChildren(
+    card(answers, el("p", { id: "annotate-hint", class: "note dim", role: "status" })),
+    el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     asked,
+    el("div", { class: "review-said" },
+      el("p", { id: "review-last", class: "review-last", hidden: true, role: "status" }, el("span"), " ", button("review-back", "Undo", "Undo this answer (Ctrl+Z)", undo, "quiet small")),
+      el("div", { id: "review-history", class: "review-history", role: "group", "aria-label": "Last answers", hidden: true })),
     el("div", { class: "annotate-head" },
       el("p", { id: "annotate-count", class: "annotate-count" }),
       button("annotate-add", "Add (A)", "Add trees by clicks on the map (A)", () => toggleAdding()),
       button("annotate-undo", "Undo", "Undo your last annotation (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
     el("div", { id: "annotate-states", class: "annotate-tools", role: "group", "aria-label": "Found trees by review state" }, ...STATES.map((each) =>
       button(`annotate-${each}`, each, `List the ${each} trees`, () => showTrees(each), "quiet small"))),
-    el("div", { class: "review-buttons", role: "group", "aria-label": "Is the selected found tree a tree?" },
-      button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree"), ""),
-      button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class on the right (N)", () => review(draft.kind), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
-      button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, "")),
-    el("div", { class: "review-said" },
-      el("p", { id: "review-last", class: "review-last", hidden: true, role: "status" }, el("span"), " ", button("review-back", "Undo", "Undo this answer (Ctrl+Z)", undo, "quiet small")),
-      el("div", { id: "review-history", class: "review-history", role: "group", "aria-label": "Last answers", hidden: true })),
-    el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
-    card(el("p", { id: "annotate-hint", class: "note dim", role: "status" })),
+    moreEvidence(),
     el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
       el("label", { title: "The ground truth of this run is never changed: an annotation that contradicts it is kept next to it" }, "Score against ",
         el("select", { id: "annotate-against", onchange: (event) => scoreAgainst(event.target.value) }, ...Object.entries(AGAINST).map(([value, text]) => el("option", { value, text })))),
@@ -84,8 +85,10 @@ async function take(file, unit) {
     draft.error = `${file.name} is larger than ${LARGEST_TABLE / 1e6} MB.`;
     return fill();
   }
+  const confirmed = () => trees().filter((tree) => reviewOf(tree) === "confirmed").length, before = confirmed();
   const done = await importTable(await file.text(), unit);
-  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}.`;
+  const more = confirmed() - before;
+  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
   fill();
 }
 

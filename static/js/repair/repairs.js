@@ -2,11 +2,11 @@
 
 import { edit, send } from "../annotate/annotations.js";
 import { byId } from "../core/dom.js";
-import { fixed } from "../core/format.js";
+import { fixed, plusMinus } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { showNews } from "../core/problem.js";
-import { changed, on, selectedTree, state, trees } from "../core/store.js";
+import { changed, on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { colours } from "../core/theme.js";
 import { drawCircle, drawLine, drawText, treeAt } from "../map/draw.js";
 import { visible } from "../shell/tabs.js";
@@ -103,17 +103,20 @@ export function repairClick(at, view) {
   const isOfTwo = ["merge", "tie"].includes(tool.kind);
   if (isOfTwo && (!tree || tree.number === tool.first.number)) return true;
   const [x, y] = view.toMap(...at);
-  if (tool.kind === "merge") sayIfApart(tool.first, tree);
+  if (tool.kind === "merge") sayIfDoubtful(treeOf(tool.first.number), tree);
   finish({ kind: tool.kind, places: [point(tool.first), isOfTwo ? point(tree) : [x, y]] });
   return true;
 }
 
-// Two trees that are farther apart than one thing can be are merged as well: the path may have drifted between them.
-function sayIfApart(one, other) {
-  const apart = distance(one, other);
-  if (apart > (state.annotations?.same_thing_m ?? Infinity)) {
-    showNews(`Trees ${one.number} and ${other.number} were ${fixed(apart, 1)} m apart: Undo takes the merge back if they are two trees.`);
+// Two trees that are farther apart than one thing can be, or whose diameters contradict each other, are merged as well: the path
+// may have drifted between them, and each may have been seen from one side only.
+function sayIfDoubtful(a, b) {
+  const apart = distance(a, b), doubts = [];
+  if (apart > (state.annotations?.same_thing_m ?? Infinity)) doubts.push(`were ${fixed(apart, 1)} m apart`);
+  if (Math.abs(a.dbh_cm - b.dbh_cm) > Math.hypot(a.sigma_dbh_cm, b.sigma_dbh_cm) && a.dbh_cm !== null && b.dbh_cm !== null) {
+    doubts.push(`have diameters that contradict each other (${plusMinus(a.dbh_cm, a.sigma_dbh_cm)} and ${plusMinus(b.dbh_cm, b.sigma_dbh_cm)} cm; the sigma of their mean covers both)`);
   }
+  if (doubts.length) showNews(`Trees ${a.number} and ${b.number} ${doubts.join(" and ")}: Undo takes the merge back if they are two trees.`);
 }
 
 function finish(fields) {

@@ -135,10 +135,12 @@ function missing(all) {
 
 let dimmed = ""; // the filter of which the map knows
 
-// The map dims what the filter leaves out.
+// The map dims what the filter leaves out and says so, in every tab.
 function showFilter(wanted, holds) {
   if (wanted === dimmed) return;
   dimmed = wanted;
+  byId("map-filter").hidden = !wanted;
+  setText(byId("map-filter"), `Filter: ${wanted} ✕`);
   state.holds = wanted ? holds : null;
   changed("filter");
 }
@@ -183,11 +185,14 @@ let source = null;
 
 function forgetFilter() {
   const now = state.status?.source;
-  if (source !== null && now !== source && byId("find").value) {
-    byId("find").value = "";
-    fill();
-  }
+  if (source !== null && now !== source && byId("find").value) removeFilter();
   source = now ?? source;
+}
+
+function removeFilter() {
+  byId("find").value = "";
+  showFilter("", null);
+  fill();
 }
 
 export function startTable() {
@@ -195,6 +200,7 @@ export function startTable() {
   on("status", forgetFilter);
   byId("find").addEventListener("input", fill);
   byId("find").title = HELP;
+  byId("map-filter").addEventListener("click", removeFilter);
   const menu = byId("trees-export");
   const optionOf = (value) => [...menu.options].find((each) => each.value === value) ?? null;
   for (const { value, text, before, edits } of ofExtensions("exportFiles")) if (!optionOf(value)) menu.add(el("option", { value, text, "data-edit": edits }), before ? optionOf(before) : null);
