@@ -141,6 +141,7 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
     [m], `ellipse` (see `ellipses`), `dbh_cm`, `sigma_dbh_cm`, `eccentricity`, `observations`, `coverage_deg`,
     `first_seen_s`, `last_seen_s`, `height_m`, `sigma_height_m`, `lean_deg` and, of a tree without a diameter,
     `sides`, see `Trees`. Unknown diameters, eccentricities, coverages, heights, leans and sides are None.
+    Positions, diameters, heights and leans are rounded once, to the decimals of trees.csv.
 
     Args:
         trees: The table.
@@ -152,11 +153,11 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
     sides = np.full(len(trees.number), np.nan) if trees.sides is None else trees.sides.astype(np.float64)
     columns: dict[str, Sequence[Any]] = {
         "number": trees.number[keep].tolist(),
-        "x": _rounded(trees.position[keep, 0]),
-        "y": _rounded(trees.position[keep, 1]),
+        "x": np.round(trees.position[keep, 0], 3).tolist(),
+        "y": np.round(trees.position[keep, 1], 3).tolist(),
         "ellipse": ellipses(trees.covariance[keep]),
-        "dbh_cm": _finite(100.0 * trees.dbh[keep]),
-        "sigma_dbh_cm": _finite(100.0 * trees.dbh_sigma[keep]),
+        "dbh_cm": _finite(100.0 * trees.dbh[keep], 1),
+        "sigma_dbh_cm": _finite(100.0 * trees.dbh_sigma[keep], 1),
         "eccentricity": _finite(trees.eccentricity[keep]),
         "observations": trees.observations[keep].tolist(),
         "coverage_deg": _finite(np.degrees(trees.coverage[keep])),
@@ -208,9 +209,9 @@ def _known(value: float) -> float | None:
     return round(value, 3) if math.isfinite(value) else None
 
 
-def _finite(values: Float) -> list[float | None]:
-    """Return numbers, shape (N,), rounded to two decimals; None where not finite."""
-    return [round(v, 2) if math.isfinite(v) else None for v in values.tolist()]
+def _finite(values: Float, digits: int = 2) -> list[float | None]:
+    """Return numbers, shape (N,), rounded to `digits` decimals; None where not finite."""
+    return [round(v, digits) if math.isfinite(v) else None for v in values.tolist()]
 
 
 def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from app.batch.run_edits import reviews_of
 from app.batch.summary import lost_share
 from app.dashboard.payload import trees_payload, truth_payload
-from app.dashboard.shown_run import ShownRun
+from app.dashboard.shown_run import ShownRun, in_file, truth_in_file
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.store.records import Change, Content, NewRun, RunFigures
@@ -246,15 +246,16 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
 
 def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None) -> RunFigures:
     """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
-    (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth).
+    (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth), in the
+    coordinates of the files.
 
     Args:
         state, scores: The state, and its scores; None if there are none.
         all_scans: Number of scans of the source; None if unknown.
     """
     shown = state.shown
-    trees = trees_payload(shown.frame.trees, start_ns=state.start_ns)
-    truth = truth_payload(state.truth)
+    trees = trees_payload(in_file(shown.frame.trees, state.one_step), start_ns=state.start_ns)
+    truth = truth_payload(truth_in_file(state.truth, state.one_step))
     return RunFigures(
         scans=shown.frame.index + 1,
         all_scans=all_scans,
@@ -267,7 +268,7 @@ def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int |
         scores=scores,
         map={
             "trees": trees,
-            "path": thinned(np.column_stack([state.path.x, state.path.y])),
+            "path": thinned(np.column_stack([state.path.x, state.path.y]) + state.offset[:2]),
             "truth": None if truth is None else truth["trees"],
         },
     )

@@ -17,6 +17,9 @@ FEW_TREES = 10
 HECTARE = 1e4  # m^2
 REINEKE = 1.605
 INCH_10 = 25.4  # cm
+# Share of the value below which the known parts of an error say nothing: the trees that the map lacks, which
+# are not among them, are then the larger part.
+NEGLIGIBLE = 0.001
 
 
 class Estimate(NamedTuple):
@@ -69,7 +72,8 @@ class StandFigures:
         without_dbh: Number of these trees without a diameter; they count with the mean basal area of the
             others.
         with_volume: Number of these trees with a volume; None if there is no volume formula.
-        detection: Mean probability that a tree in the observed part is found.
+        detection: Mean probability that a tree in the observed part is found; its error is NaN if it is
+            assumed.
         values: Dict from the names in FIGURES, which has their units, to estimates. Names that end in
             `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
             probability of detection; the others refer to the observed area.
@@ -121,9 +125,9 @@ def stand_figures(
     """Return the stand parameters of a plot.
 
     Standard errors are those of this plot, not of the stand around it: they contain the errors of the
-    diameters, the trees of the part that was not observed, and the trees that were not detected. A plot that
-    is observed completely, with certain detection and exact diameters of all trees, has standard errors of 0,
-    except for the parameters of the spatial pattern.
+    diameters, the trees of the part that was not observed, and, of corrected parameters, the trees that were
+    not detected. A plot that is observed completely, with certain detection and exact diameters of all trees,
+    has standard errors of 0, except for the parameters of the spatial pattern.
 
     Args:
         trees: Trees in the observed part, of any diameter.
@@ -133,12 +137,13 @@ def stand_figures(
         perimeter: Length of the border of the observed part [m], for the edge correction of the Clark-Evans
             index.
         detection: Mean probability of detection in the observed part and its standard error; NaN if unknown.
+            With an unknown error, standard errors of stems, basal area and volume that are below NEGLIGIBLE
+            of the value are NaN: nothing that is known limits them.
         parameters: Limits of diameters and classes.
 
     Returns:
         The stand parameters. Trees thinner than the minimum diameter do not count; those without a diameter
-        do. Unknown parameters are NaN: all but the `_plain` ones if no area was observed; the corrected ones
-        if the probability is NaN or not above 0; basal areas and volumes if there are trees, but none has a
+        do. Unknown parameters are NaN: all if no area was observed; the corrected ones if the probability is NaN or not above 0; basal areas and volumes if there are trees, but none has a
         diameter or a volume; volumes without a formula; figures of diameters if no tree has a diameter; and
         those of the pattern for fewer than two trees. `_plain` figures have no standard error. In `v_ha`,
         trees without a volume count as 0.
@@ -153,7 +158,7 @@ def stand_figures(
     if area <= 0.0:
         raise ValueError("a plot has no area")
     if seen <= 0.0:
-        warnings.append("no part of the plot was observed: no figures")
+        warnings.append("no part of the plot was observed: it has no figures and counts in no mean")
     elif n == 0:
         warnings.append("the plot has no trees")
     elif n < FEW_TREES:
@@ -169,12 +174,12 @@ def stand_figures(
         warnings.append(f"only {100.0 * seen / area:.0f} % of the plot was observed")
     p, p_se = detection
     values = dict.fromkeys(FIGURES, Estimate())
+    if seen <= 0.0:
+        return StandFigures(area, 0.0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
     every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
     plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))))
     values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)
     values["g_ha_plain"] = Estimate(HECTARE * float(plain.sum()) / area)
-    if seen <= 0.0:
-        return StandFigures(area, 0.0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
     share = min(seen / area, 1.0)
     basal, basal_var = _basal_areas(kept)
     unsure = _threshold_variance(trees, parameters.dbh_min)
@@ -188,16 +193,23 @@ def stand_figures(
     for name, weights, variance in totals:
         total, squares = float(weights.sum()), float(np.square(weights).sum())
         se = math.sqrt((1.0 - share) * squares + variance)
-        values[name] = Estimate(HECTARE * total / seen, HECTARE * se / seen)
+        assumed = math.isnan(p_se)
+        values[name] = _scaled(HECTARE / seen, total, se, assumed)
         if p > 0.0:
-            spread = (1.0 - share * p) * squares + variance + (total * p_se / p) ** 2
-            scale = HECTARE / (seen * p)
-            values[f"{name}_corrected"] = Estimate(scale * total, scale * math.sqrt(spread))
+            fit = 0.0 if assumed else total * p_se / p
+            spread = math.sqrt((1.0 - share * p) * squares + variance + fit**2)
+            values[f"{name}_corrected"] = _scaled(HECTARE / (seen * p), total, spread, assumed)
     found = share * (p if p > 0.0 else 1.0)
     values.update(_diameter_figures(kept, found, seen, parameters))
     values.update(_pattern(kept.position, seen, perimeter))
-    classes = _classes(kept, share, seen, parameters)
+    classes = _classes(kept, share, seen, parameters, math.isnan(p_se))
     return StandFigures(area, seen, n, missing, volumes, Estimate(p, p_se), values, classes, tuple(warnings))
+
+
+def _scaled(scale: float, total: float, se: float, assumed: bool) -> Estimate:
+    """Return a total and its standard error per hectare. The error is NaN if it is NEGLIGIBLE and `assumed`,
+    i.e. trees may be missing although every tree counts as found."""
+    return Estimate(scale * total, math.nan if assumed and se <= NEGLIGIBLE * total else scale * se)
 
 
 def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
@@ -333,7 +345,9 @@ def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estima
     }
 
 
-def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> tuple[DiameterClass, ...]:
+def _classes(
+    trees: PlotTrees, share: float, seen: float, parameters: Stand, assumed: bool
+) -> tuple[DiameterClass, ...]:
     """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
     included; none if no tree has a diameter. The first class begins at the minimum diameter, which makes it
     narrower unless that is a multiple of the width. Trees without a diameter are left out; thinner ones than
@@ -344,6 +358,7 @@ def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> 
         share: Share of the plot that was observed.
         seen: Observed area [m^2].
         parameters: Minimum diameter and width of a class.
+        assumed: As for `_scaled`.
     """
     known = trees.where(np.isfinite(trees.dbh))
     if not len(known.dbh):
@@ -362,8 +377,8 @@ def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> 
                 round(100.0 * max(k * width, parameters.dbh_min), 6),
                 round(100.0 * (k + 1) * width, 6),
                 n,
-                Estimate(scale * n, scale * math.sqrt(rest * n)),
-                Estimate(scale * float(basal.sum()), scale * g_se),
+                _scaled(scale, float(n), math.sqrt(rest * n), assumed),
+                _scaled(scale, float(basal.sum()), g_se, assumed),
             )
         )
     return tuple(rows)

@@ -203,12 +203,15 @@ class DetectionFunction:
     Attributes:
         sigma: Scale [m]; inf if detection does not decrease with distance.
         sigma_se: Standard error of `sigma` [m]; 0 for inf.
-        trees: Number of trees of the fit.
+        trees: Number of trees of the fit; 0 if every tree counts as found without one.
+        reason: Why there is no fit: "correction" (the parameter is "none"), "whole_cloud" (no distances are
+            known) or "few_trees"; "" if there is one.
     """
 
     sigma: float
     sigma_se: float
     trees: int
+    reason: str = ""
 
     def at(self, distance: Float) -> Float:
         """Return the probability at distances [m], in their shape; 1 for an infinite `sigma`, NaN for a
@@ -218,8 +221,9 @@ class DetectionFunction:
         )
 
     def mean(self, available: Float) -> tuple[float, float]:
-        """Return the mean probability over an area and its standard error (delta method), 0 for an infinite
-        `sigma`; both NaN if `available` is empty.
+        """Return the mean probability over an area and its standard error (delta method), NaN for an infinite
+        `sigma`, with which trees that are missed at every distance are not noticed; both NaN if `available`
+        is empty.
 
         Args:
             available: Distance of each cell of the area [m], cells of equal size, shape (K,).
@@ -229,12 +233,9 @@ class DetectionFunction:
         g = self.at(available)
         p = float(g.mean())
         if not math.isfinite(self.sigma):
-            return p, 0.0
+            return p, math.nan
         slope = float((g * np.square(available)).mean()) / self.sigma**3
         return p, slope * self.sigma_se
-
-
-CERTAIN = DetectionFunction(math.inf, 0.0, 0)
 
 
 def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | None:
@@ -279,21 +280,27 @@ def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | No
 
 def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> DetectionFunction:
     """Return the probability of detection over distance, fitted to all trees in cells of known distance, of
-    at least the minimum diameter or without one. It is 1 (CERTAIN) if the parameter `correction` is "none",
-    or if there are fewer than LEAST_TREES such trees."""
+    at least the minimum diameter or without one. It is 1 if the parameter `correction` is "none", if no
+    distance is known, or if there are fewer than LEAST_TREES such trees."""
     if parameters.correction == "none":
-        return CERTAIN
+        return _assumed("correction")
     known = seen.where(np.isfinite(seen.nearest))
+    if not len(known.nearest):
+        return _assumed("whole_cloud")
     rows = known.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
-    return fit_half_normal(known.nearest[rows[rows >= 0]], known.nearest) or CERTAIN
+    return fit_half_normal(known.nearest[rows[rows >= 0]], known.nearest) or _assumed("few_trees")
+
+
+def _assumed(reason: str) -> DetectionFunction:
+    return DetectionFunction(math.inf, 0.0, 0, reason)
 
 
 def figures_of(
     plots: Sequence[SamplePlot], trees: PlotTrees, seen: SeenArea, parameters: Stand
 ) -> dict[str, StandFigures]:
     """Return a dict from the names of the plots to their stand parameters. A plot of which more than 99.5 %
-    was observed counts as observed completely. The probability of detection is 1 in a plot with a cell of
-    unknown distance.
+    was observed counts as observed completely. The probability of detection is 1, without a known error, in a
+    plot with a cell of unknown distance.
 
     Args:
         plots: Plots with unique names.
@@ -319,7 +326,7 @@ def figures_of(
         if part > 0.995 * area:  # less than the accuracy of the raster
             part = area
         available = np.repeat(seen.nearest[cells], np.round(inside * len(offsets)).astype(int))
-        probability = detection.mean(available) if np.isfinite(available).all() else (1.0, 0.0)
+        probability = detection.mean(available) if np.isfinite(available).all() else (1.0, math.nan)
         of_plot = plot.contains(trees.position)
         result[plot.name] = stand_figures(
             trees.where(of_plot & observed),

@@ -17,7 +17,15 @@ from app.batch.run_folder import FinishedRun, read_run, read_seen_area
 from app.common.text import count, version
 from app.extensions.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
 from app.extensions.stand.parameters import Stand
-from app.extensions.stand.plots import SamplePlot, detection_function, figures_of, seen_plot, within_reach
+from app.extensions.stand.plots import (
+    LEAST_TREES,
+    DetectionFunction,
+    SamplePlot,
+    detection_function,
+    figures_of,
+    seen_plot,
+    within_reach,
+)
 from app.extensions.stand.volume import VolumeFormula
 from pipeline.errors import StemmapError
 from pipeline.io.result_files import csv_text, number_text
@@ -43,8 +51,7 @@ class StandResult:
         left_out: Dict from the reason to the number of trees of the map that no plot counts for it:
             `rejected` (in the review), `outside_of_plots` (only with plots), `outside_of_observed_area` or
             `below_minimum_dbh`, whichever comes first. A tree without a diameter is not below the minimum.
-        detection_sigma: Scale of the half-normal detection function [m]; inf if detection does not decrease
-            with distance.
+        detection: Probability of detection over distance.
         warnings: Messages, those of plots with the name of the plot.
     """
 
@@ -58,7 +65,7 @@ class StandResult:
     figures: dict[str, StandFigures]
     total: dict[str, Estimate]
     left_out: dict[str, int]
-    detection_sigma: float
+    detection: DetectionFunction
     warnings: tuple[str, ...]
 
 
@@ -103,7 +110,7 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
             f"{'the plot is' if len(chosen) == 1 else 'all plots are'} outside of what the run observed",
             where=str(folder),
             remedy=f"Check the coordinates; the map is in {frame.title} coordinates, "
-            f"{_extent(frame.to_crs(seen.centres))}",
+            f"{extent_words(frame.to_crs(seen.centres))}",
         )
     for name, f in figures.items():
         warnings += [f"plot {name}: {text}" if plots else text for text in f.warnings]
@@ -117,7 +124,6 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     elif np.isfinite(trees.dbh).sum() >= 3 and np.nanmax(trees.dbh) < 0.02:
         warnings.append("all diameters are below 2 cm: is the column dbh_cm of trees.csv in metres?")
     total = combined(figures) if len(chosen) > 1 else dict(figures[chosen[0].name].values)
-    sigma = detection_function(trees, seen, parameters).sigma
     left_out = {"rejected": run.rejected, **_left_out(trees, plots, seen, parameters.dbh_min)}
     return StandResult(
         run,
@@ -130,7 +136,7 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         figures,
         total,
         left_out,
-        sigma,
+        detection_function(trees, seen, parameters),
         tuple(warnings),
     )
 
@@ -168,7 +174,7 @@ def _plot_trees(trees: Trees, formula: str) -> PlotTrees:
     return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, *volume)
 
 
-def _extent(points: np.ndarray) -> str:
+def extent_words(points: np.ndarray) -> str:
     """Return the bounding box of points, shape (N, 2) [m], as text; N is at least 1."""
     low, high = points.min(axis=0), points.max(axis=0)
     return f"x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} to {high[1]:.0f} m"
@@ -222,7 +228,8 @@ def stand_record(result: StandResult) -> dict[str, Any]:
     - `parameters`: dict of the parameters of `Stand`;
     - `trees_in_map`: number of trees, with rejected ones; `trees_left_out`: dict from a reason to the number
     of trees that no plot counts;
-    - `detection_sigma_m`: None if all trees are assumed to be detected;
+    - `detection_sigma_m`: None if detection does not decrease with distance or is not estimated;
+    - `detection_not_estimated`: the reason, see `DetectionFunction`, "" if it is estimated;
     - `units`: dict from each stand parameter to its unit;
     - `plots`: dict from the name of each plot to a dict with `area_m2`, `seen_m2`, `trees`,
     `trees_without_dbh`, `trees_with_volume` (None if unknown), `detection` (a stand parameter), the other
@@ -237,7 +244,8 @@ def stand_record(result: StandResult) -> dict[str, Any]:
         "parameters": result.parameters.model_dump(),
         "trees_in_map": len(result.trees.dbh) + result.run.rejected,
         "trees_left_out": result.left_out,
-        "detection_sigma_m": _finite(result.detection_sigma),
+        "detection_sigma_m": _finite(result.detection.sigma),
+        "detection_not_estimated": result.detection.reason,
         "units": {name: unit for name, (_, unit) in FIGURES.items()},
         "plots": {
             name: {
@@ -289,13 +297,13 @@ def _numbers(values: Sequence[float]) -> list[str]:
 
 
 def stand_summary(result: StandResult) -> list[str]:
-    """Return the stand parameters over all plots as lines for people: the number of trees and the area, trees
+    """Return the stand parameters over all observed plots as lines for people: their trees and area, trees
     that are not counted if there are any, the stand parameters that have a value, detection, and the meaning
     of the standard errors. Warnings are not included."""
-    seen = sum(f.seen for f in result.figures.values())
-    area = sum(f.area for f in result.figures.values())
-    trees = sum(f.trees for f in result.figures.values())
-    of = "whole observed area" if result.whole else count(len(result.figures), "plot")
+    observed = [f for f in result.figures.values() if f.seen > 0.0]
+    seen, area = sum(f.seen for f in observed), sum(f.area for f in observed)
+    trees = sum(f.trees for f in observed)
+    of = "whole observed area" if result.whole else count(len(observed), "plot")
     least = f"{100.0 * result.parameters.dbh_min:g} cm"
     part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
     left_out = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in result.left_out.items() if n)
@@ -309,19 +317,29 @@ def stand_summary(result: StandResult) -> list[str]:
         value, se = result.total[name]
         if math.isfinite(value):
             error = f" +- {_digits(se)}" if math.isfinite(se) else ""
-            lines.append(f"{title}: {_digits(value)}{error} {unit}".rstrip())
-    sigma = result.detection_sigma
-    if math.isfinite(sigma):
-        lines.append(f"detection: half-normal over distance, sigma {sigma:.1f} m")
+            unknown = "" if error or name.endswith("_plain") else ", standard error not known"
+            lines.append(f"{title}: {_digits(value)}{error} {unit}".rstrip() + unknown)
+    detection = result.detection
+    if math.isfinite(detection.sigma):
+        lines.append(f"detection: half-normal over distance, sigma {detection.sigma:.1f} m")
         lines.append(
             "which to use: the figures without correction; corrected ones only where trees far from the path "
             "were missed, because they are too large where the stand is thinner there"
         )
     else:
-        lines.append("detection: does not decrease with distance within reach")
-    errors = "between plots" if len(result.figures) > 1 else "of this area: diameters, occlusion, detection"
-    lines.append(f"+- standard error {errors}")
+        lines.append(f"detection: {_NO_DECREASE[detection.reason]}")
+    corrected = "; corrected figures also detection" if math.isfinite(detection.sigma) else ""
+    errors = "between plots" if len(observed) > 1 else f"of this area: diameters, occlusion{corrected}"
+    lines.append(f"+- standard error {errors}; trees that the map lacks are not included")
     return lines
+
+
+_NO_DECREASE = {
+    "": "does not decrease with distance within reach",
+    "correction": "not estimated, every tree in view counts as found",
+    "whole_cloud": "not estimated for a whole cloud, every tree counts as found",
+    "few_trees": f"not estimated from fewer than {LEAST_TREES} trees, every tree in view counts as found",
+}
 
 
 def _digits(value: float) -> str:

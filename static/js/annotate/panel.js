@@ -1,7 +1,8 @@
 // The tab Annotate: review of the found trees, the list of annotations, and the keys of the tab.
 
+import { placeTexts } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
-import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
+import { count, dbhText, figure, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
@@ -119,8 +120,7 @@ function show(line, row) {
   const mapped = treeOf(treeNumberOf(row))?.dbh_cm ?? null;
   line.dbh.placeholder = mapped === null ? NONE : `mapped ${figure(mapped)}`;
   setText(tree, String(treeNumberOf(row) ?? NONE));
-  setText(x, fixed(place.x, 2));
-  setText(y, fixed(place.y, 2));
+  placeTexts([place.x, place.y]).forEach((text, axis) => setText([x, y][axis], text));
   setText(who, row.who);
   who.title = `${row.who}, ${new Date(1000 * row.at_s).toLocaleString()}`;
   line.node.setAttribute("aria-selected", String(row.id === draft.chosen));

@@ -1,8 +1,9 @@
 // The text of an empty panel: what to do, or that nothing needs to be done.
 
-import { state } from "./store.js";
+import { isDrive, state } from "./store.js";
 
-export const nothingYet = (what = "Nothing mapped") => state.status?.state === "starting"
+export const nothingYet = (what = "Nothing mapped") => (state.status?.state ?? "starting") === "starting"
   ? "Starting; this fills with the first scan."
+  : !isDrive() ? `${what} yet; this fills when the cloud is mapped.`
   : state.status?.state === "playing" ? `${what} yet; this fills with the next scan.`
   : `${what} yet. Press play, or open a run.`;

@@ -48,19 +48,18 @@ export function roughly(seconds) {
   return `${seconds > 10 ? 10 * Math.round(seconds / 10) : Math.max(1, Math.round(seconds))} s`;
 }
 
-// x and y of a tree [m]: rounded first as the server rounds those of the table, so that both show the same.
-export const placeText = (position) => `${position.map((value) => fixed(Number(value.toFixed(4)), 2)).join(", ")} m`;
-
 // --- trees -------------------------------------------------------------------------------------
 
 // Whether the sigma of a tree is assumed: no single scan detected it, only the accumulated scans did.
 export const isAssumed = (tree) => tree.observations === 0;
 
-export function dbhText({ dbh_cm: dbh, sigma_dbh_cm: sigma }) {
-  if (dbh === null) return "DBH not measured";
-  return `DBH ${plusMinus(dbh, sigma)} cm`;
-}
+// A figure of a tree with the decimals that it has in the files.
+const asInFiles = (decimals) => (value, sigma) => (known(value) && known(sigma) ? `${fixed(value, decimals)} ± ${fixed(sigma, decimals)}` : fixed(value, decimals));
+export const dbhFigure = asInFiles(1); // [cm]
+export const heightFigure = asInFiles(2); // [m]
 
-export const heightText = ({ height_m: height, sigma_height_m: sigma }) => (known(height) ? `${plusMinus(height, sigma)} m` : "not seen");
+export const dbhText = ({ dbh_cm: dbh, sigma_dbh_cm: sigma }) => (dbh === null ? "DBH not measured" : `DBH ${dbhFigure(dbh, sigma)} cm`);
+
+export const heightText = ({ height_m: height, sigma_height_m: sigma }) => (known(height) ? `${heightFigure(height, sigma)} m` : "not seen");
 
 export const seenText = (tree) => (isAssumed(tree) ? "detected in no single scan, only in the accumulated scans" : `detected in ${count(tree.observations, "scan")}`);

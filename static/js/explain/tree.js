@@ -1,7 +1,7 @@
 // The story of a tree: verdict, diameter, observed sides, and the history of its position.
 
 import { definitions, el, letterOf } from "../core/dom.js";
-import { clock, count, figure, isAssumed, NONE, placeText, plusMinus } from "../core/format.js";
+import { clock, count, dbhFigure, figure, isAssumed, NONE } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
 import { timeLink } from "../playback/time_link.js";
@@ -31,7 +31,7 @@ function seen(story) {
 }
 
 function overview(story, showCluster) {
-  const dbh = story.dbh === null ? NONE : `${plusMinus(100 * story.dbh, 100 * story.dbh_sigma)} cm`;
+  const dbh = story.dbh === null ? NONE : `${dbhFigure(100 * story.dbh, 100 * story.dbh_sigma)} cm`;
   const rows = [["DBH", dbh], ["covered", `${figure(story.coverage_deg)}° of 360°`], ["x, y", placeText(story.position)],
     ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["eccentricity e", figure(story.eccentricity)]];
   return el("div", { class: "story-fit" }, covered(story), el("div", {},

@@ -112,5 +112,5 @@ function changes({ revisions }) {
 const COLUMNS = ["tree", "x_m", "y_m", "sigma_m", "dbh_cm", "sigma_dbh_cm", "eccentricity", "observations", "review"];
 
 function treeRows(trees) {
-  return [COLUMNS, ...trees.map((t) => [t.number, t.x.toFixed(4), t.y.toFixed(4), t.ellipse[0].toFixed(4), t.dbh_cm, t.sigma_dbh_cm, t.eccentricity, t.observations, t.review ?? "open"])];
+  return [COLUMNS, ...trees.map((t) => [t.number, t.x.toFixed(3), t.y.toFixed(3), t.ellipse[0].toFixed(4), t.dbh_cm, t.sigma_dbh_cm, t.eccentricity, t.observations, t.review ?? "open"])];
 }

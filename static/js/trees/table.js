@@ -4,7 +4,8 @@ import { reviewOf } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
-import { count, figure, fixed, isAssumed, NONE, plusMinus } from "../core/format.js";
+import { placeTexts } from "../core/coordinates.js";
+import { count, dbhFigure, figure, fixed, heightFigure, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
 import { roving } from "../core/roving.js";
@@ -25,11 +26,11 @@ const MARKS = { open: "", confirmed: " ✓", rejected: " ✕", skipped: " ↷" }
 // key, title, tooltip, text, value for sorting (null if unknown), and whether it is shown only without a drive (true) or with one (false)
 const COLUMNS = [
   ["number", "tree", "Number of the tree; ✓ confirmed, ✕ rejected, ↷ skipped in the review", (t) => `${t.number}${MARKS[reviewOf(t)]}`, (t) => t.number],
-  ["x", "x m", "x in the frame of the map: of a drive along the first heading, else as in the file minus its offset", (t) => fixed(t.x, 2), (t) => t.x],
-  ["y", "y m", "y in the frame of the map: of a drive to the left of the first heading, else as in the file minus its offset", (t) => fixed(t.y, 2), (t) => t.y],
+  ["x", "x m", "x as in the files: of a drive in the frame of the map, along the first heading", (t) => placeTexts([t.x, t.y])[0], (t) => t.x],
+  ["y", "y m", "y as in the files: of a drive in the frame of the map, to the left of the first heading", (t) => placeTexts([t.x, t.y])[1], (t) => t.y],
   ["sigma", "position ± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
-  ["dbh", "DBH cm", "Diameter at breast height ± its standard deviation", (t) => dbh(t), (t) => t.dbh_cm],
-  ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or it was not seen", (t) => (t.height_m === null ? NONE : plusMinus(t.height_m, t.sigma_height_m)), (t) => t.height_m, true],
+  ["dbh", "DBH cm", "Diameter at breast height ± its standard deviation", (t) => dbhFigure(t.dbh_cm, t.sigma_dbh_cm), (t) => t.dbh_cm],
+  ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or it was not seen", (t) => heightFigure(t.height_m, t.sigma_height_m), (t) => t.height_m, true],
   ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg, true],
   ["e", "e", "Eccentricity: ratio of the eigenvalues of the covariance of a cluster, the mean over its scans", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
   ["seen", "scans", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
@@ -38,11 +39,6 @@ const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
 const rows = new Map();
 const keepTabStop = roving(byId("trees").tBodies[0], "tr", "vertical");
 let order = { key: "number", descending: false };
-
-function dbh(tree) {
-  if (tree.dbh_cm === null) return NONE;
-  return plusMinus(tree.dbh_cm, tree.sigma_dbh_cm);
-}
 
 function sigmaText(tree) {
   return (isAssumed(tree) ? "≈ " : "") + figure(sigma(tree), 2);

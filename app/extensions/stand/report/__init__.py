@@ -154,7 +154,7 @@ def report_page(
         figures=figures,
         trees_in_map=len(whole.trees.dbh) + whole.run.rejected,
         no_error=any(
-            round(f.values["n_ha"].se, 3) == 0.0 and f.trees > 0 and f.seen >= f.area
+            math.isnan(f.values["n_ha"].se) and f.seen > 0.0
             for result in (whole, of_plots)
             for f in (result.figures.values() if result else ())
         ),
@@ -404,7 +404,8 @@ def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dic
     """
     classes = whole.figures["all"].classes
     width, height = 170.0, 60.0
-    top = max((c.n_ha.value + c.n_ha.se for c in classes), default=0.0)
+    errors = np.nan_to_num([c.n_ha.se for c in classes]).tolist()  # no bar for an unknown one
+    top = max((c.n_ha.value + se for c, se in zip(classes, errors, strict=True)), default=0.0)
     step = _step(max(top, 1e-9) / 3.0)
     top = max(math.ceil(top / step), 1) * step
     each = width / max(len(classes), 1)
@@ -415,12 +416,12 @@ def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dic
             "y": height * (1.0 - c.n_ha.value / top),
             "width": 0.8 * each,
             "height": height * c.n_ha.value / top,
-            "high": height * (1.0 - (c.n_ha.value + c.n_ha.se) / top),
-            "low": height * (1.0 - max(c.n_ha.value - c.n_ha.se, 0.0) / top),
+            "high": height * (1.0 - (c.n_ha.value + se) / top),
+            "low": height * (1.0 - max(c.n_ha.value - se, 0.0) / top),
             "label": number.short(c.low),
             "edge": k * each,
         }
-        for k, c in enumerate(classes)
+        for k, (c, se) in enumerate(zip(classes, errors, strict=True))
     ]
     marks = [(height * (1.0 - v / top), number(v, 0)) for v in np.arange(0.0, top + 0.5 * step, step)]
     last = number.short(classes[-1].high) if classes else ""

@@ -155,17 +155,19 @@ async def detour(dashboard: Dash) -> Response:
 @router.post("/plots")
 async def add(body: _AddPlot, dashboard: Dash) -> Response:
     """Add plots in one edit; return their numbers (`ids`) and the counts of edits, see `edited`, with 201.
-    409 if another run was opened meanwhile, 422 for a shape that is no area, a name that is taken, or too
-    many plots or corners."""
+    409 if another run was opened meanwhile, 422 for a shape that is no area, a name that is taken, too many
+    plots or corners, or if all are outside of a whole cloud."""
     return await _added(dashboard, body, [(plot.name, plot.shape.model_dump()) for plot in body.plots])
 
 
 @router.post("/plots/along")
 async def add_along(body: _Along, dashboard: Dash) -> Response:
     """Add circles along the path in one edit; responses as in `add`, and 409 before the first scan, 422 if
-    there would be too many or, as the path is shorter than half of `every`, none."""
+    there would be too many or, as the path is shorter than half of `every`, none, or for a whole cloud."""
     if dashboard.path is None:
         raise NothingMappedError
+    if dashboard.status.one_step is not None:
+        raise BadRequestError("a whole cloud has no path", remedy="Draw or type plots, or import a file")
     with as_bad_request():
         centres = centres_along(dashboard.path_xy, body.every).round(3).tolist()
     circles = [{"kind": "circle", "x": x, "y": y, "radius": body.radius} for x, y in centres]
@@ -224,7 +226,8 @@ async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response
 async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, dict[str, Any]]]) -> Response:
     """Add plots in one edit, and return the response 201 with their `ids`, see `edited`. `plots` has the name
     ("" for the next free number) and the shape (dict, see `plot_of`) of each plot. Raises BadRequestError if
-    a shape or name is not valid, a name is taken or there would be too many plots or corners; errors of
+    a shape or name is not valid, a name is taken, there would be too many plots or corners, or all are outside
+    of a whole cloud; errors of
     `apply_edit` and `edited` pass through."""
     taken, contents = _names(dashboard), []
     for name, shape in plots:
@@ -240,8 +243,28 @@ async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, di
             f"a run can have at most {MOST_PLOTS} plots with {_MOST_CORNERS} corners",
             remedy="Simplify the plots, or use stemmap stand --plots FILE",
         )
+    with as_bad_request():
+        _check_extent(dashboard, [plot_of(name, shape).shape for name, shape in plots])
     ids = await apply_edit(dashboard, body, Store.add, contents)
     return await edited(dashboard, body, {"ids": ids}, 201)
+
+
+def _check_extent(dashboard: Dashboard, shapes: Sequence[Any]) -> None:
+    """Raise a StemmapError if all shapes, polygons in the frame of the map, lie outside of a whole cloud. A
+    drive may still reach them."""
+    shown = dashboard.shown
+    counts = None if dashboard.status.one_step is None or shown is None else shown.counts
+    if counts is None or counts.covered is None or not len(counts.covered):
+        return
+    from app.extensions.stand.run_figures import extent_words
+
+    corners = np.stack([counts.covered.min(axis=0), counts.covered.max(axis=0)])
+    (x0, y0), (x1, y1) = corners.tolist()
+    if not any(s.bounds[0] < x1 and s.bounds[2] > x0 and s.bounds[1] < y1 and s.bounds[3] > y0 for s in shapes):
+        raise StemmapError(
+            f"{'the plot is' if len(shapes) == 1 else 'all plots are'} outside of the cloud",
+            remedy=f"Check the coordinates; the cloud has {extent_words(corners + dashboard.offset)}",
+        )
 
 
 def _names(dashboard: Dashboard) -> set[str]:

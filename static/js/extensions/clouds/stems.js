@@ -1,7 +1,8 @@
 // The story of a stem of a whole cloud: its height, cross-sections with the fitted circles, and the stem curve.
 
 import { definitions, el, letterOf } from "../../core/dom.js";
-import { count, figure, fixed, NONE, placeText, plusMinus } from "../../core/format.js";
+import { placeText } from "../../core/coordinates.js";
+import { count, dbhFigure, figure, fixed, heightFigure, NONE } from "../../core/format.js";
 import { circle, line, picture, scaleBar, svg, text } from "../../core/svg.js";
 import { verdictOf } from "../../core/verdicts.js";
 import { checks, failureText, verdict } from "../../explain/cluster.js";
@@ -38,8 +39,8 @@ function figures(story, stem) {
   const [major, minor] = story.ellipse;
   const measured = story.dbh !== null, seen = stem.height !== null;
   return el("div", { class: "stem-figures" }, definitions([
-    ["DBH", measured ? `${plusMinus(100 * story.dbh, 100 * story.dbh_sigma)} cm` : NONE],
-    ["height", seen ? `${plusMinus(stem.height, stem.height_sigma)} m` : "not seen"],
+    ["DBH", measured ? `${dbhFigure(100 * story.dbh, 100 * story.dbh_sigma)} cm` : NONE],
+    ["height", seen ? `${heightFigure(stem.height, stem.height_sigma)} m` : "not seen"],
     ["lean", `${fixed(stem.lean_deg, 1)}°`], ["covered", `${figure(story.coverage_deg)}° of 360°`],
     ["x, y", placeText(story.position)], ["position ±", `${figure(100 * major, 2)} × ${figure(100 * minor, 2)} cm`]]),
   measured ? "" : el("p", { class: "dim note", text: `The DBH needs ${figure(story.dbh_arc_deg)}° of the circumference.` }),

@@ -2,6 +2,7 @@
 // of the map. Files, plots and the report have it then.
 
 import { draft, edit, news, remove, send } from "../../annotate/annotations.js";
+import { offset } from "../../core/coordinates.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
 import { count, fixed, NONE } from "../../core/format.js";
 import { on, selectedTree, state, treeOf } from "../../core/store.js";
@@ -10,7 +11,7 @@ import { draw, plotting, sketch } from "./plots.js";
 const HOW = { control: "control points", gnss: "GNSS fixes of the recording", hand: "values by hand", file: "coordinates of the file, already in the system" };
 const HAND = [["east", "east m", "East of the map's origin, m"], ["north", "north m", "North of the map's origin, m"],
   ["turn_deg", "turn °", "Angle of the map's x axis from east to north, °"], ["z", "height m", "Height of the map's zero, m"]];
-const COLUMNS = [["name", "point", "Name of the point"], ["x", "x m", "x in the map"], ["y", "y m", "y in the map"], ["east", "east m", "East in the reference system"],
+const COLUMNS = [["name", "point", "Name of the point"], ["x", "x m", "x in the coordinates of the files"], ["y", "y m", "y in the coordinates of the files"], ["east", "east m", "East in the reference system"],
   ["north", "north m", "North in the reference system"], ["z", "height m", "Height in the reference system; may be empty"]];
 const PLACE = ["x", "y"];
 const POINT_SIGMA = 0.125; // m, that of the command line
@@ -131,12 +132,15 @@ function fillResiduals() {
 }
 
 function cell(point, row, name, title) {
-  if (point.tree !== null && PLACE.includes(name)) return el("td", { text: fixed(treeOf(point.tree)?.[name], 2) });
-  const value = PLACE.includes(name) ? number(point[name])?.toFixed(3) : point[name];
+  const axis = PLACE.indexOf(name), by = offset()[axis] ?? 0;
+  const known = number((point.tree === null ? point : treeOf(point.tree))?.[name] ?? "");
+  if (point.tree !== null && axis >= 0) return el("td", { text: fixed(known === null ? null : known + by, 3) });
+  const value = axis < 0 ? point[name] : known === null ? "" : (known + by).toFixed(3);
   return el("td", {}, el("input", { name, value: String(value ?? ""), title, type: name === "name" ? "text" : "number", step: "any", maxlength: "60", autocomplete: "off", "aria-label": `${title} of point ${row + 1}`,
     placeholder: name === "name" ? titleOf({ ...point, name: "" }, row) : null,
     oninput: (event) => {
-      point[name] = event.target.value;
+      const typed = number(event.target.value);
+      point[name] = axis < 0 ? event.target.value : typed === null ? "" : typed - by;
       dirty = true;
       fillResiduals();
       news();
@@ -170,7 +174,7 @@ function load() {
     points = (found?.points ?? []).map((point) => ({ ...point, name: point.name === String(point.tree) ? "" : point.name, z: point.z ?? "" }));
     if (found) {
       byId("coordinates-crs").value = found.crs;
-      byId("coordinates-how").value = found.how;
+      byId("coordinates-how").value = found.frame.method === "file" ? "file" : found.how;
       const { east_m, north_m, turn_rad, z_m } = found.frame;
       const hand = { east: east_m, north: north_m, turn_deg: (turn_rad * 180) / Math.PI, z: z_m };
       for (const [name, value] of Object.entries(hand)) byId(`coordinates-${name}`).value = String(Number(value.toFixed(name === "turn_deg" ? 6 : 3)));

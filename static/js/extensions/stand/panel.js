@@ -2,10 +2,12 @@
 
 import { draft, historyOf, remove, reviewOf, rows as annotations, STATES, treeNumberOf } from "../../annotate/annotations.js";
 import { get } from "../../core/api.js";
+import { inMap, offset } from "../../core/coordinates.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
+import { nothingYet } from "../../core/empty_state.js";
 import { count, figure, percent, plusMinus, withSigma } from "../../core/format.js";
 import { looksOnly } from "../../core/permissions.js";
-import { on, state, trees } from "../../core/store.js";
+import { isDrive, on, state, trees } from "../../core/store.js";
 import { keepFresh } from "../../core/timing.js";
 import { titleOf } from "../../open/run_title.js";
 import { startCoordinates } from "./coordinates.js";
@@ -59,13 +61,13 @@ function typed() {
   return el("form", { class: "plot-form", onreset: () => fields.replaceChildren(...made("circle")), onsubmit: (event) => {
     event.preventDefault();
     const form = event.target;
-    const names = ["x", "y", ...FIELDS[kind.value].map(([name]) => name)];
-    addPlots([{ name: form.elements.name.value.trim(), shape: { kind: kind.value, ...Object.fromEntries(names.map((name) => [name, numberOf(form, name)])) } }]);
-  } }, kind, el("label", {}, "x m", number("x", 0, "x of the centre in the map, m")), el("label", {}, "y m", number("y", 0, "y of the centre in the map, m")), fields,
+    const [x, y] = inMap(numberOf(form, "x"), numberOf(form, "y"));
+    addPlots([{ name: form.elements.name.value.trim(), shape: { kind: kind.value, x, y, ...Object.fromEntries(FIELDS[kind.value].map(([name]) => [name, numberOf(form, name)])) } }]);
+  } }, kind, el("label", {}, "x m", number("x", 0, "x of the centre in the coordinates of the files, m")), el("label", {}, "y m", number("y", 0, "y of the centre in the coordinates of the files, m")), fields,
   el("label", {}, "name", el("input", { type: "text", name: "name", maxlength: "60", placeholder: "next number", autocomplete: "off" })), el("button", { class: "small", text: "Add" }));
 }
 
-const alongPath = () => el("form", { class: "plot-form", onsubmit: (event) => {
+const alongPath = () => el("form", { id: "plots-along", class: "plot-form", onsubmit: (event) => {
   event.preventDefault();
   addAlong(numberOf(event.target, "every"), numberOf(event.target, "radius"));
 } }, el("span", { class: "dim", text: "along the path:" }), el("label", {}, "a circle every", number("every", 20, "Distance along the path, m", 0.01, 10_000), "m"), el("label", {}, "radius", number("radius", 5.64, "Radius of the circles, m", 0.01, 500), "m"), el("button", { class: "small", text: "Add circles" }));
@@ -98,7 +100,7 @@ function build() {
       el("div", { class: "annotate-head" }, el("span", { class: "dim", text: "Draw" }),
         ...Object.entries(SHAPES).map(([kind, text]) => button(`plot-${kind}`, text, `Draw a ${kind} on the map`, () => draw(kind))), el("span", { class: "grow" }),
         button("plot-undo", "Undo", "Undo your last edit of plots or coordinates (Ctrl+Z)", undo), button("plot-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
-      el("details", { class: "plot-more" }, el("summary", { text: "Type a plot, place plots along the path, or import a file" }), typed(), alongPath(), imported()),
+      el("details", { class: "plot-more" }, el("summary", { id: "plots-more" }), typed(), alongPath(), imported()),
       el("details", { id: "coordinates", class: "plot-more" })),
     el("p", { id: "plots-hint", class: "note dim", role: "status" }), el("p", { id: "plots-error", class: "error", role: "alert", hidden: true }),
     el("p", { id: "plots-review", class: "note dim" }),
@@ -115,7 +117,8 @@ function build() {
 const SMALL_ERROR = 0.001; // of the value; smaller errors are not shown as a number
 
 function estimate([value, se] = [null, null]) {
-  if (se === null || value === null) return el("td", { text: figure(value) });
+  if (value === null) return el("td", { text: figure(value) });
+  if (se === null) return el("td", {}, figure(value), el("small", { text: " ± not known" }));
   if (se < SMALL_ERROR * value) return el("td", {}, figure(value), el("small", { text: " ± < 0.1 %" }));
   const [text, error] = withSigma(value, se);
   return el("td", {}, text, el("small", { text: ` ± ${error}` }));
@@ -187,27 +190,31 @@ function hint() {
   if (sketch.kind === "point") return "Click a tree or a mark on the map whose coordinates are known. Esc ends.";
   if (sketch.kind === "polygon") return "Click each corner on the map; click the first corner or press Enter to finish. Esc ends.";
   if (drawing()) return `Drag on the map from ${sketch.kind === "circle" ? "the centre outwards" : "corner to corner"}, or click both ends. Esc ends.${sketch.kind === "circle" ? " Then its radius can be typed in the list." : ""}`;
-  if (!state.map) return "Nothing mapped yet: press play, then draw plots on the map.";
+  if (!state.map) return nothingYet();
   const drawn = plots().length > 0;
   const { trees_in_map: all, trees_left_out: leftOut = {} } = (drawn ? figures.plots : figures.all) ?? {};
   const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
   const trees = all === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${all} trees in the map are counted.`}`;
   if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
-  return `Trees of the map at the shown time.${trees} ± is the standard error. That of a count does not contain missed trees, and is about 0 where the whole plot was observed; for the mean it is the variation between plots.`;
+  return `Trees of the map at the shown time.${trees} ± is the standard error; trees that the map lacks are not included. For the mean it is the variation between plots.`;
 }
 
-const SMALL_ERROR_NOTE = " The error of N/ha is small because all of the area was observed and few diameters are near the minimum; trees that the map lacks are not included.";
+const UNKNOWN_ERROR = " The error of the stems is not known where all of the area was observed and no diameter is near the minimum: it is that of the trees that the map lacks.";
+const NO_DECREASE = { "": "Detection does not decrease with distance within reach: the figures are not corrected.",
+  correction: "Detection is not estimated: every tree in view counts as found.",
+  whole_cloud: "Detection is not estimated for a whole cloud: every tree counts as found.",
+  few_trees: "Detection is not estimated, because it needs 20 trees in view: every tree in view counts as found." };
 
-// Which of the figures with and without correction to use, as `stemmap stand` prints it, and what a small error means.
+// Which of the figures with and without correction to use, as `stemmap stand` prints it, and why an error is not known.
 function detectionText() {
   const { all, plots: own } = figures;
   const shownPlots = [all, own].flatMap((each) => Object.values(each?.plots ?? {}));
-  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: [stems, se], trees }) => trees > 0 && se !== null && se < SMALL_ERROR * stems) ? SMALL_ERROR_NOTE : "");
+  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: [stems, se] }) => stems !== null && se === null) ? UNKNOWN_ERROR : "");
 }
 
-function correctionText({ detection_sigma_m: sigma, plots: of, mean }) {
+function correctionText({ detection_sigma_m: sigma, detection_not_estimated: reason, plots: of, mean }) {
   if (!of) return "";
-  if (sigma === null) return "Detection does not decrease with distance within reach: the figures need no correction.";
+  if (sigma === null) return NO_DECREASE[reason];
   const { n_ha_corrected: stems, g_ha_corrected: basal } = mean;
   const words = (of, unit) => `${plusMinus(...of)} ${unit}`;
   return `Use the figures above. If trees far from the path were missed, use the corrected ones: ${words(stems, "stems/ha")}, ${words(basal, "m²/ha")} `
@@ -233,6 +240,7 @@ function resetFields() {
   if (!now || now === run) return;
   if (run) draft.error = "";
   run = now;
+  offset().forEach((value, axis) => { document.querySelector(`#plots-edit [name=${["x", "y"][axis]}]`).defaultValue = value; });
   for (const form of document.querySelectorAll("#plots-edit form")) form.reset();
   byId("plot-crs").value = "";
   for (const { node } of lines.values()) node.remove();
@@ -243,6 +251,8 @@ function fill() {
   if (!plotting()) return;
   resetFields();
   for (const kind of Object.keys(SHAPES)) byId(`plot-${kind}`).setAttribute("aria-pressed", String(sketch.kind === kind));
+  byId("plots-along").hidden = !isDrive();
+  setText(byId("plots-more"), `Type a plot, ${isDrive() ? "place plots along the path, " : ""}or import a file`);
   byId("plot-undo").disabled = !canUndo();
   byId("plot-redo").disabled = !canRedo();
   setText(byId("plots-hint"), hint());
@@ -276,6 +286,7 @@ export function startPlotsPanel() {
   build();
   startCoordinates();
   on("map", () => { if (!state.map) { figures = { all: null, plots: null, problem: "" }; shown = []; } });
+  on("map", () => { if (plotting()) setText(byId("plots-hint"), hint()); });
   on("tab", () => { if (!plotting()) stopDrawing(); });
   on("tab annotations annotating sketch parameters remapped", fill);
   on("map tab annotations parameters remapped", refresh);

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from app.extensions.stand.plots import CERTAIN, fit_half_normal
+from app.extensions.stand.plots import DetectionFunction, fit_half_normal
 
 
 def fitted(distance, available):
@@ -61,11 +61,14 @@ def test_a_complete_map_is_rarely_corrected():
     cells = 15.0 * np.sqrt(np.linspace(0, 1, 3000))
     fits = [fitted(15.0 * np.sqrt(random.random(150)), cells) for _ in range(200)]
     assert np.mean([math.isinf(fit.sigma) for fit in fits]) > 0.9
-    assert CERTAIN.mean(cells) == (1.0, 0.0)
-    np.testing.assert_array_equal(CERTAIN.at(cells), 1.0)
+    even = DetectionFunction(math.inf, 0.0, 150)
+    p, se = even.mean(cells)
+    assert p == 1.0
+    assert math.isnan(se)  # trees that are missed at every distance are not noticed
+    np.testing.assert_array_equal(even.at(cells), 1.0)
 
 
 def test_few_trees_or_no_area_give_no_function():
     assert fit_half_normal(np.full(19, 3.0), np.linspace(0, 9, 50)) is None
     assert fit_half_normal(np.full(30, 3.0), np.zeros(0)) is None
-    assert all(math.isnan(x) for x in CERTAIN.mean(np.zeros(0)))
+    assert all(math.isnan(x) for x in DetectionFunction(math.inf, 0.0, 0).mean(np.zeros(0)))

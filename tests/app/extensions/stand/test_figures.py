@@ -215,13 +215,34 @@ def test_volume_counts_the_trees_that_have_one():
 
 
 def test_plain_figures_of_several_plots_refer_to_their_whole_area():
-    """Also to that of a plot that was not observed at all."""
     inside = PlotTrees(np.array([[1.0, 1.0], [4.0, 4.0]]), np.full(2, 0.2), np.full(2, 0.01))
     nothing = inside.where(np.zeros(2, np.bool_))
     common: dict[str, Any] = {"perimeter": 40.0, "detection": (1.0, 0.0), "parameters": Stand()}
     plots = {
         "seen": stand_figures(inside, nothing, area=100.0, seen=100.0, **common),
-        "hidden": stand_figures(nothing, inside, area=300.0, seen=0.0, **common),
+        "partly": stand_figures(nothing, inside, area=300.0, seen=100.0, **common),
     }
     assert combined(plots)["n_ha_plain"].value == pytest.approx(1e4 * 4 / 400.0)
-    assert combined(plots)["n_ha"].value == pytest.approx(1e4 * 2 / 100.0)
+    assert combined(plots)["n_ha"].value == pytest.approx(1e4 * 2 / 200.0)
+
+
+def test_a_plot_that_was_not_observed_is_no_area_without_trees():
+    trees = trees_of([0.2] * 20)
+    alone, hidden = figures(trees), figures(trees.where(np.zeros(20, np.bool_)), seen=0.0)
+    assert all(math.isnan(value) for value, _ in hidden.values.values())
+    means = combined({"alone": alone, "hidden": hidden})
+    for name, (value, _) in alone.values.items():
+        assert means[name].value == pytest.approx(value, nan_ok=True), name
+
+
+def test_an_error_of_0_is_not_known_while_detection_is_assumed():
+    trees = trees_of([0.2] * 20)
+    f = figures(trees, detection=(1.0, math.nan))
+    assert f.values["n_ha"].value == f.values["n_ha_corrected"].value == 200.0
+    assert math.isnan(f.values["n_ha"].se)
+    assert math.isnan(f.values["n_ha_corrected"].se)
+    assert all(math.isnan(c.n_ha.se) for c in f.classes)
+    half = figures(trees, seen=500.0, detection=(1.0, math.nan))
+    assert half.values["n_ha"] == figures(trees, seen=500.0).values["n_ha"]
+    unsure = figures(trees_of([0.2] * 20, [0.01] * 20), detection=(1.0, math.nan))
+    assert unsure.values["g_ha"].se > 0.0

@@ -203,14 +203,14 @@ def test_the_date_of_the_recording_is_that_of_its_first_scan(tmp_path, capsys):
     assert recorded_time("simulated run", 1714732872 * 10**9) == recorded_time("pcap", 5 * 10**9) == {}
 
 
-def test_a_small_error_is_not_rounded_to_0_and_an_error_of_0_is_explained(run, tmp_path, capsys):
+def test_a_small_error_is_not_rounded_to_0_and_one_that_is_not_known_is_explained(run, tmp_path, capsys):
     errors = {0.0: 0, 3.0: 0, 0.3: 1, 0.04: 2, 1e-9: 0, math.nan: 0}
     assert {se: _digits(Estimate(1365.6, se)) for se in errors} == errors
     assert _digits(Estimate(5.0, 0.2), 0) == 1
     text = page_of(capsys, run, tmp_path / "r.html")  # at 20 cm of 1 cm, 7 cm is far
-    assert catalogue_of("en")["zero_error"] in text
+    assert catalogue_of("en")["unknown_error"] in text
     fewer = page_of(capsys, run, tmp_path / "f.html", ["--dbh-min", "0.2"])
-    assert catalogue_of("en")["zero_error"] not in fewer
+    assert catalogue_of("en")["unknown_error"] not in fewer
 
 
 def test_the_first_class_begins_at_the_minimum_diameter(run, tmp_path, capsys):

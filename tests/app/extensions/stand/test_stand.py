@@ -169,6 +169,32 @@ def test_few_trees_and_empty_plots_are_warnings(run, capsys):
     assert "plot 1: the plot has no trees" in empty.err
 
 
+def test_a_plot_that_was_not_observed_is_left_out_of_the_mean_and_named(run, tmp_path, capsys):
+    alone = stemmap(capsys, "stand", run, "--circle", "10,10,5")
+    both = stemmap(capsys, "stand", run, "--circle", "10,10,5", "--circle", "500,10,5", "--out", tmp_path / "b")
+    assert "plot 2: no part of the plot was observed: it has no figures and counts in no mean" in both.err
+    assert both.out.startswith("1 plot: ")
+    rows = table(tmp_path / "b" / "stand.csv")
+    assert rows["mean"]["n_ha_plain"] == rows["1"]["n_ha_plain"]
+    assert rows["2"]["n_ha_plain"] == ""
+    stems = next(line for line in alone.out.splitlines() if line.startswith("Stems per hectare of the whole"))
+    assert stems in both.out.splitlines()
+
+
+def test_what_is_not_known_of_detection_is_said_and_no_error_is_0(run, tmp_path, capsys):
+    many = stemmap(capsys, "stand", run).out
+    assert "Stems per hectare: 2,500 1/ha, standard error not known" in many
+    assert "detection: does not decrease with distance within reach" in many
+    assert "+- 0.00" not in many
+    assert "trees that the map lacks are not included" in many
+    position = np.random.default_rng(2).uniform(1, 19, (12, 2))
+    few = stemmap(capsys, "stand", write_run(tmp_path / "few", position, np.full(12, 0.2)), "--out", tmp_path)
+    assert "detection: not estimated from fewer than 20 trees, every tree in view counts as found" in few.out
+    record = json.loads((tmp_path / "stand.json").read_text())
+    assert record["detection_not_estimated"] == "few_trees"
+    assert record["plots"]["all"]["n_ha"][1] is None
+
+
 def test_two_plots_of_one_name_are_refused(run, tmp_path, capsys):
     file = written(tmp_path, "p.gpkg", [shapely.box(0, 0, 9, 9)] * 2, names=["x", "x"])
     stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local").refused(
@@ -231,6 +257,7 @@ def test_trees_far_from_every_view_are_corrected_for_detection(tmp_path, capsys)
     assert float(row["n_ha"]) < 12000
     none = stemmap(capsys, "stand", run, "--out", tmp_path / "none", "--correction", "none")
     assert none.code == 0
+    assert "detection: not estimated, every tree in view counts as found" in none.out
     row = table(tmp_path / "none" / "stand.csv")["all"]
     assert row["n_ha"] == row["n_ha_corrected"]
 
