@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from app.common.height_range import height_range
 from app.explain.records import half_axes
 from app.worker.course import QUANTITIES
 from app.worker.protocol import RunCourse, Shown
@@ -32,7 +33,8 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
     standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; `health`, `trees`, `clusters`,
     `layers` and `clearance`, the results of the functions of this module; `loops`, pairs of scans,
     `problems` and `repaired_numbers`, as in `Shown`; `repairs`, the `identity_of` the repairs to which they
-    belong; `intensity`, `has_intensity` of `Shown`; and the keys of `counts_of`.
+    belong; `intensity`, `has_intensity` of `Shown`; `height_range`, the heights at the ends of the colour
+    ramp [m], see `height_range`; and the keys of `counts_of`.
 
     Args:
         shown: The scan with the map.
@@ -56,6 +58,7 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         "layers": layer_counts(frame),
         "clearance": clearance_payload(frame.clearance),
         "intensity": shown.has_intensity,
+        "height_range": [round(height, 1) for height in height_range(frame)],
         "loops": shown.loops.tolist(),
         "repairs": identity_of(shown.repairs),
         "problems": list(shown.problems),

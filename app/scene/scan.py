@@ -9,6 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from app.common.height_range import height_range
 from app.scene import colours, nodes
 from app.scene.colours import Colours, ViewSettings
 from app.scene.nodes import MOST_LABELS, OWN_TREE, Batch, CloudNode, Float, Label, LabelNodes, Place, short
@@ -18,8 +19,6 @@ from pipeline.types.records import Frame, Verdict
 Vector = tuple[float, float, float]
 OnCluster = Callable[[int | None, Vector, Vector], None]
 
-# Heights at the ends of the colour ramp: about those of ground and trunks of a stand [m].
-HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
 SCAN = f"{ROBOT}/scan"
 FILTERED_SIZE, CLUSTER_SIZE = 0.03, 0.045  # diameter of a point of a scan [m]
 # Without a drive: diameters of a point [m], and points across the map.
@@ -171,16 +170,6 @@ def extent(frame: Frame) -> float:
     """Return the longer side of the bounding box of the filtered points in x and y [m]; 0 if there are no
     points."""
     return float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
-
-
-def height_range(frame: Frame) -> tuple[float, float]:
-    """Return the lower and upper end of the colour ramp, heights in the level frame of the sensor [m]:
-    HEIGHT_LOW and HEIGHT_HIGH for a scan and for a map without points; the percentiles 1 and 99 of the
-    filtered points without a drive."""
-    if frame.of_drive or not len(frame.filtered):
-        return HEIGHT_LOW, HEIGHT_HIGH
-    low, high = np.percentile(frame.filtered[:, 2], (1.0, 99.0))
-    return float(low), float(high)
 
 
 def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:

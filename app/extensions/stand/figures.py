@@ -143,10 +143,11 @@ def stand_figures(
 
     Returns:
         The stand parameters. Trees thinner than the minimum diameter do not count; those without a diameter
-        do. Unknown parameters are NaN: all if no area was observed; the corrected ones if the probability is NaN or not above 0; basal areas and volumes if there are trees, but none has a
-        diameter or a volume; volumes without a formula; figures of diameters if no tree has a diameter; and
-        those of the pattern for fewer than two trees. `_plain` figures have no standard error. In `v_ha`,
-        trees without a volume count as 0.
+        do. Unknown parameters are NaN: all if no area was observed; the corrected ones if the probability is
+        NaN or not above 0; basal areas and volumes if there are trees, but none has a diameter or a volume;
+        volumes without a formula; figures of diameters if no tree has a diameter; and those of the pattern
+        for fewer than two trees. `_plain` figures have no standard error. In `v_ha`, trees without a volume
+        count as 0.
 
     Raises:
         ValueError: The plot has no area.

@@ -2,7 +2,7 @@
 
 import { patch } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { capital } from "../core/format.js";
+import { capital, fixed } from "../core/format.js";
 import { startPopover } from "../core/popover.js";
 import { attempted } from "../core/problem.js";
 import { isDrive, on, state } from "../core/store.js";
@@ -13,7 +13,8 @@ const EVERY = 500; // [ms] between two updates of the counts
 const TITLES = { colour_by: "Colour by", label_by: "Labels", accumulated: "Accumulated" };
 // What the colours of the scene mean where they are a ramp: title and ticks.
 const BARS = {
-  height: (drive) => (drive ? ["height of the scan relative to the sensor", ["−1 m", "+1 m", "+3 m"]] : ["height", ["low", "high"]]),
+  height: (drive) => (drive ? ["height of the scan relative to the sensor", ["−1 m", "+1 m", "+3 m"]]
+    : ["height above the ground in the middle", (state.map?.height_range ?? []).map((height) => `${fixed(height, 1)} m`)]),
   intensity: (drive) => (!drive ? ["intensity is shown for drives only", []] : state.map?.intensity === false ? ["this source has no intensity", []] : ["intensity of the raw points", ["weak", "strong"]]),
   eccentricity: () => ["eccentricity e of a cluster", ["1 round", "10", "100 a line"]],
 };
@@ -58,8 +59,9 @@ function showBar({ colour_by: { value }, ramp }) {
   bar.hidden = !words;
   if (!words) return;
   const [title, ticks] = words(isDrive());
-  if (bar.dataset.shown === title) return;
-  bar.dataset.shown = title;
+  const now = [title, ...ticks].join();
+  if (bar.dataset.shown === now) return;
+  bar.dataset.shown = now;
   setText(bar.querySelector("figcaption"), capital(title));
   bar.querySelector("i").hidden = !ticks.length;
   bar.querySelector("i").style.background = `linear-gradient(90deg, ${ramp.join(", ")})`;

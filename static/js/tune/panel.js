@@ -128,7 +128,7 @@ function showSets() {
   if (list.dataset.shown !== key) {
     list.dataset.shown = key;
     const option = ([name, title]) => el("option", { value: name, text: name, title });
-    list.replaceChildren(el("option", { value: "", text: `${state.parameters.preset}, changed`, hidden: true }),
+    list.replaceChildren(el("option", { value: "", text: `● ${state.parameters.preset}`, title: `Values differ from ${state.parameters.preset}`, hidden: true }),
       el("optgroup", { label: "Presets" }, ...choices.slice(0, tuning.presets.length).map(option)),
       ...(savedSets().length ? [el("optgroup", { label: "Saved sets" }, ...choices.slice(tuning.presets.length).map(option))] : []));
   }

@@ -270,7 +270,7 @@ def _digits(estimate: Estimate, least: int | None = None) -> int:
 def tree_rows(run: PlottedRun, texts: dict[str, str], number: Numbers) -> list[list[str]]:
     """Return the trees as cells: number, two coordinates [m], diameter and its sigma [cm], height and its
     sigma [m] if any height is known, observations, coverage [deg], state of the review; a dash for unknown
-    values.
+    values. Numbers have the decimals of trees.csv, as on the page.
 
     Args:
         run: The run, in the coordinates of its files.
@@ -282,11 +282,11 @@ def tree_rows(run: PlottedRun, texts: dict[str, str], number: Numbers) -> list[l
     return [
         [
             str(c["tree"][k]),
-            number(float(run.place[k, 0]), 2),
-            number(float(run.place[k, 1]), 2),
+            number(float(run.place[k, 0]), 3),
+            number(float(run.place[k, 1]), 3),
             number(float(c["dbh_cm"][k]), 1),
             number(float(c["sigma_dbh_cm"][k]), 1),
-            *(number(float(c[name][k]), 1) for name in heights),
+            *(number(float(c[name][k]), 2) for name in heights),
             str(c["observations"][k]),
             number(float(c["coverage_deg"][k]), 0),
             texts[str(c["review"][k])],

@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import shapely
 from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
@@ -226,9 +227,8 @@ async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response
 async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, dict[str, Any]]]) -> Response:
     """Add plots in one edit, and return the response 201 with their `ids`, see `edited`. `plots` has the name
     ("" for the next free number) and the shape (dict, see `plot_of`) of each plot. Raises BadRequestError if
-    a shape or name is not valid, a name is taken, there would be too many plots or corners, or all are outside
-    of a whole cloud; errors of
-    `apply_edit` and `edited` pass through."""
+    a shape or name is not valid, a name is taken, there would be too many plots or corners, or all are
+    outside of a whole cloud; errors of `apply_edit` and `edited` pass through."""
     taken, contents = _names(dashboard), []
     for name, shape in plots:
         name = _checked_name(name, taken) if name else _free("", taken)
@@ -259,8 +259,7 @@ def _check_extent(dashboard: Dashboard, shapes: Sequence[Any]) -> None:
     from app.extensions.stand.run_figures import extent_words
 
     corners = np.stack([counts.covered.min(axis=0), counts.covered.max(axis=0)])
-    (x0, y0), (x1, y1) = corners.tolist()
-    if not any(s.bounds[0] < x1 and s.bounds[2] > x0 and s.bounds[1] < y1 and s.bounds[3] > y0 for s in shapes):
+    if not shapely.box(*corners.ravel()).intersects(shapely.union_all(shapes)):
         raise StemmapError(
             f"{'the plot is' if len(shapes) == 1 else 'all plots are'} outside of the cloud",
             remedy=f"Check the coordinates; the cloud has {extent_words(corners + dashboard.offset)}",
