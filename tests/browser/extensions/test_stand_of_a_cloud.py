@@ -26,9 +26,12 @@ def page(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     folder: Path = tmp_path_factory.mktemp("stand")
     write_las(folder / "plot.laz", np.concatenate([ground(10.0, 0.05, rng), *stems]), offset=UTM)
     with (
-        Server(str(folder / "plot.laz"), STEMMAP_FOLDER=str(folder / "store")) as server,
+        Server("sim:stand?duration=5", STEMMAP_FOLDER=str(folder / "store")) as server,
         opened(chromium, server.link) as made,
     ):
+        made.pause()
+        made.open(str(folder / "plot.laz"))
+        expect(made.page.locator("#state b")).to_have_text("Mapped")
         expect(made.page.locator("#trees tbody tr")).to_have_count(len(PLACES))
         yield made
         assert made.errors == []
