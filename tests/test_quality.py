@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -114,3 +115,10 @@ def test_viser_is_pinned_and_both_open3d_are_never_required_together():
     assert '"viser==1.1.1"' in text
     assert re.search(r'"open3d-cpu[^"]*;[^"]*==', text)
     assert re.search(r'"open3d>[^"]*;[^"]*!=', text)
+
+
+def test_the_citation_names_this_version():
+    about = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
+    assert f"version: {about['version']}" in lines
+    assert f"license: {about['license']}" in lines

@@ -22,7 +22,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "scenario",
         metavar="SCENARIO",
-        help="stand, paper, slope, dense or long, with options as in 'stand?odometry=poor&sigma=0.03' "
+        help="stand, paper, slope, dense, long, crossing or wild, with options as in "
+        "'stand?odometry=poor&sigma=0.03' "
         "(seed, sigma, odometry = good, normal, poor or exact, duration, trees, drive)",
     )
     parser.add_argument("--out", required=True, type=_mcap, metavar="RUN.mcap", help="the file to write")

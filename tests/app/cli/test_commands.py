@@ -20,6 +20,7 @@ from app.common.text import COMPILING
 from pipeline.config import PRESETS, field_specs, from_toml, preset
 from pipeline.jit import on_compiling, others_compile
 from pipeline.odometry.lidar_odometry import LOST
+from pipeline.simulation.scenarios import SCENARIOS
 
 RUN = "sim:paper?duration=2"
 
@@ -44,6 +45,11 @@ def stemmap(capsys: pytest.CaptureFixture[str], *words: object) -> Told:
     code = main([str(word) for word in words])
     told = capsys.readouterr()
     return Told(code, told.out, told.err)
+
+
+def test_the_help_of_simulate_names_every_scenario(capsys):
+    words = re.findall(r"\w+", stemmap(capsys, "simulate", "--help").out)
+    assert not [name for name in SCENARIOS if name not in words]
 
 
 def test_an_option_that_is_mistyped_is_named(capsys):
