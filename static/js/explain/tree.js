@@ -1,7 +1,7 @@
 // The story of a tree: verdict, diameter, observed sides, and the history of its position.
 
-import { definitions, el, letterOf } from "../core/dom.js";
 import { placeText } from "../core/coordinates.js";
+import { definitions, el, letterOf } from "../core/dom.js";
 import { clock, count, dbhFigure, figure, isAssumed, NONE } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
