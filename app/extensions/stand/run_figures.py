@@ -47,7 +47,8 @@ class StandResult:
         whole: Whether there are no plots, and the only one is the whole observed area.
         seen: Observed area within reach.
         figures: Dict from the name of each plot to its stand parameters.
-        total: Dict from each stand parameter to its mean over the plots; with one plot, that of the plot.
+        total: Dict from each stand parameter to its mean over the plots; with one observed plot, that of
+            the plot.
         left_out: Dict from the reason to the number of trees of the map that no plot counts for it:
             `rejected` (in the review), `outside_of_plots` (only with plots), `outside_of_observed_area` or
             `below_minimum_dbh`, whichever comes first. A tree without a diameter is not below the minimum.
@@ -105,7 +106,8 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     trees = _plot_trees(run.trees, parameters.volume)
     chosen = list(plots) or [seen_plot(ALL, seen)]
     figures = figures_of(chosen, trees, seen, parameters)
-    if not any(f.seen > 0.0 for f in figures.values()):
+    observed = [f for f in figures.values() if f.seen > 0.0]
+    if not observed:
         raise StemmapError(
             f"{'the plot is' if len(chosen) == 1 else 'all plots are'} outside of what the run observed",
             where=str(folder),
@@ -123,7 +125,7 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         warnings.append("a diameter is larger than 3 m: is the column dbh_cm of trees.csv in centimetres?")
     elif np.isfinite(trees.dbh).sum() >= 3 and np.nanmax(trees.dbh) < 0.02:
         warnings.append("all diameters are below 2 cm: is the column dbh_cm of trees.csv in metres?")
-    total = combined(figures) if len(chosen) > 1 else dict(figures[chosen[0].name].values)
+    total = combined(figures) if len(observed) > 1 else dict(observed[0].values)
     left_out = {"rejected": run.rejected, **_left_out(trees, plots, seen, parameters.dbh_min)}
     return StandResult(
         run,

@@ -320,10 +320,10 @@ def test_heights_and_residuals_are_listed_where_there_are_any(run, tmp_path, cap
     trees = run / "trees.csv"
     header, first, *others = trees.read_text().splitlines()
     cells = dict(zip(header.split(","), first.split(","), strict=True))
-    cells.update(height_m="21.4", sigma_height_m="0.3")
+    cells.update(height_m="21.40", sigma_height_m="0.30")
     trees.write_text("\n".join([header, ",".join(cells.values()), *others]))
     points = tmp_path / "points.csv"
     points.write_text("tree,x_m,y_m,easting,northing\n,0,0,500000,5300000\n,10,0,500010.02,5300000\n")
     stemmap(capsys, "georeference", run, "--control", points, "--crs", "EPSG:25832")
     shown = Page(page_of(capsys, run, tmp_path / "full.html")).texts
-    assert {"Height m", "21.4", "0.3", "1: \N{MINUS SIGN}1.0, 0.0; 2: 1.0, 0.0"} <= set(shown)
+    assert {"Height m", "21.40", "0.30", "1: \N{MINUS SIGN}1.0, 0.0; 2: 1.0, 0.0"} <= set(shown)

@@ -180,6 +180,7 @@ def test_a_plot_that_was_not_observed_is_left_out_of_the_mean_and_named(run, tmp
     assert rows["2"]["n_ha_plain"] == ""
     stems = next(line for line in alone.out.splitlines() if line.startswith("Stems per hectare of the whole"))
     assert stems in both.out.splitlines()
+    assert next(line for line in alone.out.splitlines() if line.startswith("Mean diameter")) in both.out
 
 
 def test_what_is_not_known_of_detection_is_said_and_no_error_is_0(run, tmp_path, capsys):
