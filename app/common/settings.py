@@ -55,7 +55,7 @@ class RunBudget(NamedTuple):
 
     @property
     def scans(self) -> int:
-        """Share of the files for the scans of the source; of 2 GB, for the last six minutes of a VLP-16."""
+        """Share of the files for the scans of the source; of 2 GB, for the last five minutes of a VLP-16."""
         return 7 * self.files // 16
 
     @property

@@ -323,17 +323,26 @@ def moved_with_trees(
     Args:
         trees: The trees before they are moved.
         rows: The annotations of objects and skipped trees.
-        moves: Position of each moved tree before and after [m].
+        moves: Position of each moved tree before and after [m], in the order of the moves.
     """
-    changes: list[tuple[int, int, Content | None]] = []
-    number_of = {row.id: numbers_at(trees, [(row.content.x, row.content.y)], confirmed=True) for row in rows}
+    placed = [(row.content.x, row.content.y) for row in rows]
+    numbers = [numbers_at(trees, [place], confirmed=True) for place in placed]
     for start, end in moves:
         number = numbers_at(trees, [start], confirmed=True)
-        for row in rows if number else ():
-            if number_of[row.id] == number:
-                x, y = row.content.x + end[0] - start[0], row.content.y + end[1] - start[1]
-                changes.append((row.id, row.version, replace(row.content, x=x, y=y)))
-    return changes
+        if not number:
+            continue
+        step = np.subtract(end, start)
+        is_moved = trees.number == number[0]
+        trees = replace(trees, position=trees.position + np.where(is_moved[:, None], step, 0.0))
+        placed = [
+            (place[0] + float(step[0]), place[1] + float(step[1])) if own == number else place
+            for place, own in zip(placed, numbers, strict=True)
+        ]
+    return [
+        (row.id, row.version, replace(row.content, x=x, y=y))
+        for row, (x, y) in zip(rows, placed, strict=True)
+        if (x, y) != (row.content.x, row.content.y)
+    ]
 
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -57,7 +58,7 @@ class Dashboard:
 
     Attributes:
         status: Newest status of the worker.
-        recordings: Paths of the files to which live runs were to be recorded so far.
+        recordings: Files to which live runs were recorded so far.
         shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
         seen: Views of the observed area.
         leaving: Coroutine functions that are called when the run is left, and at the end.
@@ -92,7 +93,8 @@ class Dashboard:
         self.camera = CameraView(self.worker_client)
         self.selector = Selector(self)
         self.source = SourceRequest("")
-        self.recordings: list[str] = []
+        self._record = ""  # file that was named for the recording of the run
+        self.recordings: list[FilePath] = []
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.loop = LoopPlayback(self)
@@ -222,8 +224,7 @@ class Dashboard:
         source = command.request()
         self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self.run, self.source, self.digest = None, source, ""
-        if command.record:
-            self.recordings.append(command.record)
+        self._record = command.record
         self.live.publish("source", source.for_page())
         self.camera.forget()
         self.run_recorder.leave()
@@ -515,6 +516,11 @@ class Dashboard:
         if self._notice and status.state == "paused":
             status = replace(status, detail=self._notice)
         self.status = status
+        word, _, rest = status.recording.partition(" ")
+        if self._record and word in ("recording", "finishing", "recorded"):
+            file = FilePath(self._record).with_name(rest.partition(",")[0])  # with a number if it existed
+            if file not in self.recordings:
+                self.recordings.append(file)
         self.live.publish("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
             self._broadcast_events()

@@ -247,7 +247,7 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
 def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None) -> RunFigures:
     """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
     (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth), in the
-    coordinates of the files.
+    coordinates of the files, which are those of the map plus `offset`.
 
     Args:
         state, scores: The state, and its scores; None if there are none.
@@ -270,6 +270,7 @@ def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int |
             "trees": trees,
             "path": thinned(np.column_stack([state.path.x, state.path.y]) + state.offset[:2]),
             "truth": None if truth is None else truth["trees"],
+            "offset": list(state.offset[:2]),
         },
     )
 
@@ -332,7 +333,7 @@ class ReviewedRuns:
                 source = row["source"]
                 if source not in contents:
                     contents[source] = store.contents(source)
-                return rejected(_reviews(store.book.trees(number), contents[source]))
+                return rejected(_reviews(store.book.map(number), contents[source]))
 
             self._rejected[number] = state, await self._store.ask(count)
         return self._rejected[number][1]
@@ -343,17 +344,19 @@ def rejected(reviews: dict[int, str]) -> int:
     return sum(review == REJECTED for review in reviews.values())
 
 
-def _reviews(trees: list[dict[str, Any]], contents: list[Content]) -> dict[int, str]:
-    """Return the result of `reviews_of` for the trees of a stored map."""
+def _reviews(stored: dict[str, Any], contents: list[Content]) -> dict[int, str]:
+    """Return the result of `reviews_of` for the trees of a stored map, by annotations in its frame."""
+    trees = stored["trees"]
     position = np.array([(tree["x"], tree["y"]) for tree in trees], np.float64).reshape(-1, 2)
-    return reviews_of([tree["number"] for tree in trees], position, contents)
+    offset = stored.get("offset", (0.0, 0.0))  # of the coordinates of the file
+    return reviews_of([tree["number"] for tree in trees], position - offset, contents)
 
 
 def _reviewed(store: Store, number: int) -> dict[str, Any]:
     """Return a run, see `ReviewedRuns.whole`."""
     row = store.book.whole(number)
     trees = row["map"]["trees"]
-    reviews = _reviews(trees, store.contents(row["source"]))
+    reviews = _reviews(row["map"], store.contents(row["source"]))
     for tree in trees:
         tree["review"] = reviews.get(tree["number"], OPEN)
     return {**row, "trees": len(trees) - rejected(reviews), "rejected": rejected(reviews)}

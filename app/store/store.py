@@ -48,6 +48,7 @@ from app.store.records import (
     KINDS,
     MOST_ANNOTATIONS,
     MOST_SETS,
+    REPAIR,
     SKIPPED,
     Annotation,
     Author,
@@ -223,13 +224,12 @@ class RunRecords:
             changes = [_plain(each) for each in connection.execute(query).all()]
         return {**_plain(row), "map": stored, "revisions": changes}
 
-    def trees(self, record: int) -> list[dict[str, Any]]:
-        """Return the trees of the map of a run, see `RunFigures`, also of a deleted one; [] for an unknown
+    def map(self, record: int) -> dict[str, Any]:
+        """Return the map of a run, see `RunFigures`, also of a deleted one; one without trees for an unknown
         run."""
         with self._engine.begin() as connection:
             stored = connection.execute(select(_maps.c.map).where(_maps.c.record == record)).scalar()
-        trees: list[dict[str, Any]] = (stored or {}).get("trees", [])
-        return trees
+        return stored or {"trees": []}
 
     def put_files(self, record: int, files: bytes) -> None:
         """Store the result files of a run, a zip archive; nothing happens if it does not exist."""
@@ -593,7 +593,8 @@ class Store:
 
     def steps(self, run: int, browser: str) -> tuple[dict[str, int], dict[str, int]]:
         """Return the numbers of steps that a browser can undo and redo, as dicts from the subject of the
-        steps: "tree" for annotations of KINDS and SKIPPED, else the class of the first annotation of a step.
+        steps, that of the first annotation of a step: "tree" for KINDS and SKIPPED, "repair", or "other" for
+        the reference system and classes of extensions.
 
         Args:
             run: Number of the source, see `open_run`.
@@ -695,7 +696,7 @@ class Store:
     def _turn(self, run: int, author: Author, to: Literal["done", "undone"], subjects: Sequence[str]) -> None:
         """Undo or redo the next step of a browser. If an annotation of the step was changed since, or the run
         would get a second reference system, nothing is undone or redone, and the step can never be undone or
-        redone again.
+        redone again, unless a later edit of the same browser is the reason.
 
         Args:
             run: Number of the source.
@@ -717,11 +718,16 @@ class Store:
             stale = next((row for c, row in pairs if row.made_by != (c.id if back else c.made_before)), None)
             if stale is None and any(row.deleted and row.kind == FRAME for _, row in pairs):
                 stale = _frame(connection, run)
-            state = to if stale is None else "left"
+            own = stale is not None and _is_of_a_later_step(connection, stale, author)
+            state = to if stale is None else ("done" if back else "undone") if own else "left"
             connection.execute(update(_steps).where(_steps.c.id == step).values(state=state))
             for change, row in () if stale is not None else pairs:
                 content, by = (change.before, change.made_before) if back else (change.after, change.id)
                 self._put(connection, author, row, content, by)
+        if own:
+            raise StaleError(
+                "a later edit of yours changed the same annotation", remedy="Undo that edit first, in its tab"
+            )
         if stale is not None:  # not earlier: the skip of the step must persist
             raise _stale(stale)
 
@@ -776,14 +782,14 @@ def _next_step(connection: Connection, run: int, author: Author, to: str, subjec
 
 def _subject(kind: str) -> str:
     """Return the subject of an annotation of a class, see `Store.steps`."""
-    return "tree" if kind in (*KINDS, SKIPPED) else kind
+    return "tree" if kind in (*KINDS, SKIPPED) else kind if kind == REPAIR else "other"
 
 
 def _subject_of_step() -> ScalarSelect[str]:
     """Return the subject of a step, that of its first annotation, as an expression of the row of `steps`."""
     kind = _annotations.c.kind
     return (
-        select(case((kind.in_((*KINDS, SKIPPED)), "tree"), else_=kind))
+        select(case((kind.in_((*KINDS, SKIPPED)), "tree"), (kind == REPAIR, REPAIR), else_="other"))
         .join(_changes, _changes.c.annotation == _annotations.c.id)
         .where(_changes.c.step == _steps.c.id)
         .order_by(_changes.c.id)
@@ -845,6 +851,18 @@ def _inserted(connection: Connection, statement: Insert) -> int:
     key = connection.execute(statement).inserted_primary_key
     assert key is not None  # noqa: S101 - one row was inserted
     return int(key[0])
+
+
+def _is_of_a_later_step(connection: Connection, row: Row[Any], author: Author) -> bool:
+    """Return whether the present content of an annotation is that of an edit of this browser that was not
+    undone."""
+    made_by = (
+        select(_steps.c.browser, _steps.c.state)
+        .join(_changes, _changes.c.step == _steps.c.id)
+        .where(_changes.c.id == row.made_by)
+    )
+    step = connection.execute(made_by).one_or_none()
+    return step is not None and step.browser == author.browser and step.state == "done"
 
 
 def _stale(row: Row[Any]) -> StaleError:

@@ -142,7 +142,7 @@ def serve(
         SystemExit: The dashboard fails at its start.
     """
 
-    recordings: list[str] = []
+    recordings: list[Path] = []
 
     async def make_app(port: int, tokens: AccessTokens) -> ASGIApp:
         nonlocal recordings
@@ -165,7 +165,7 @@ def serve(
         return run_server(settings, make_app)
     finally:  # a signal ends the server by an exception
         for path in recordings:
-            if Path(path).is_file():  # without a message there is none
+            if path.is_file():  # without a message there is none
                 print(f"Recording: {path}", flush=True)  # noqa: T201
 
 

@@ -95,9 +95,9 @@ class BlockFile:
         return len(self._begins) >= blocks and min(self._begins[:blocks], default=0) >= self._kept_from
 
     def is_new(self, index: int) -> bool:
-        """Return whether a block is stored, and half the file or more can be written before it is dropped."""
-        half = 0 if self._file is None or not self._drops_oldest else self._file.end - self._most // 2
-        return index in self and self._begins[index] >= half
+        """Return whether a block is stored, and is among those in the newest eighth of a full file."""
+        eighth = 0 if self._file is None or not self._drops_oldest else self._file.end - self._most // 8
+        return index in self and self._begins[index] >= eighth
 
     def put_block(self, index: int, content: bytes) -> bool:
         """Store a block at the end of the file, unless its number is stored already or the file is closed. If
@@ -120,7 +120,9 @@ class BlockFile:
             if begin is None:
                 self._refuse(index, f"the limit of {self._most / 1e9:.1f} GB is reached")
                 return False
-            if index % BLOCKS_BETWEEN_CHECKS == 0 and free_space(LARGE) < SPARE_BYTES + len(block):
+            grows = begin + len(block) <= self._most  # else it takes the place of others
+            is_due = grows and index % BLOCKS_BETWEEN_CHECKS == 0
+            if is_due and free_space(LARGE) < SPARE_BYTES + len(block):
                 self._refuse(index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
                 return False
             file.kept_from = max(file.kept_from, begin + len(block) - self._most)

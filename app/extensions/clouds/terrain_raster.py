@@ -33,6 +33,7 @@ COLUMN, BIN, BINS = 2.0, 0.25, 256
 #: depth below this bin in which nothing but noise is, least depth of that on average [m], and least share of
 #: the bins there that noise occupies. Of real plots, the depth is 0 to 0.5 m, and 3 m and more with noise.
 DENSE, CLEARLY_BELOW, DEEP, OCCUPIED = 0.005, 1.0, 1.25, 0.05
+MOST_NOISE = 0.012  # of the points of a plot
 BLOCK = 32  # columns of the raster whose neighbours are sorted at once, likewise
 
 
@@ -136,6 +137,8 @@ class NoiseBelow:
         is_below = (np.arange(BINS) >= 1) & (np.arange(BINS) < dense[:, None] - round(CLEARLY_BELOW / BIN))
         below = n[is_below]
         is_shallow = len(below) * BIN < DEEP * len(n) or not len(n)
+        # More than about a per cent of the points is undergrowth over ground that is hardly seen.
+        is_shallow |= bool(below.sum() > MOST_NOISE * n.sum())
         if is_shallow or (share := float((below > 0.0).mean())) < OCCUPIED:
             return None
         noise = max(-np.log(max(1.0 - share, 0.01)), float(np.median(below)))  # nearly all may be occupied

@@ -46,8 +46,9 @@ _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[
 _TRIES = 20
 #: Points of a tile of a cloud; the form of files with fewer points is not clear.
 _TILE = 20_000
-#: Share of a step by which two odometries of the same motion differ: a systematic error of wheels is less.
-_STEP_SHARE = 0.1
+#: Length of the steps by which two odometries are compared [m], and the share of it and the turn [rad] by
+#: which they differ with the same motion: systematic errors of wheels are less.
+_STEP, _STEP_SHARE, _STEP_TURN = 1.0, 0.1, 0.05
 #: Distance of a sensor from the origin by which the frame of its points is known [m].
 _DECISIVE = 1.0
 
@@ -399,15 +400,20 @@ def _rows(count: int, numbers: Int) -> Int:
 
 def _have_same_steps(first: list[Pose3 | None], second: list[Pose3 | None]) -> bool:
     """Return whether two lists of the poses of the same scans, None for a scan without one, have the same
-    steps from scan to scan, up to _STEP_SHARE of the length and what a centimetre and 0.01 rad change."""
-    steps = [
-        (a0.inverse() @ a1, b0.inverse() @ b1)
-        for a0, a1, b0, b1 in zip(first, first[1:], second, second[1:], strict=False)
-        if a0 is not None and a1 is not None and b0 is not None and b1 is not None
-    ]
-    far = [np.linalg.norm(a.t - b.t) > 0.01 + _STEP_SHARE * np.linalg.norm(a.t) for a, b in steps]
-    turned = [np.abs(a.R - b.R).max() > 0.01 for a, b in steps]
-    return bool(steps) and float(np.mean(np.logical_or(far, turned))) < 0.5
+    steps of _STEP or more, most of them up to _STEP_SHARE of the length and _STEP_TURN; False without a
+    step."""
+    both = [(a, b) for a, b in zip(first, second, strict=True) if a is not None and b is not None]
+    same = list[bool]()
+    last = both[:1]
+    for a1, b1 in both:
+        a0, b0 = last[0]
+        a, b = a0.inverse() @ a1, b0.inverse() @ b1
+        if np.linalg.norm(a.t) < _STEP:
+            continue
+        is_near = np.linalg.norm(a.t - b.t) < _STEP_SHARE * np.linalg.norm(a.t)
+        same.append(bool(is_near) and bool(np.abs(a.R - b.R).max() < _STEP_TURN))
+        last = [(a1, b1)]
+    return bool(same) and float(np.mean(same)) > 0.5
 
 
 def _texts_of_poses(place: Path) -> list[Path]:

@@ -1,6 +1,7 @@
 // The tab Repair: tools for trees and loops, and the list of repairs.
 
 import { draft, historyOf } from "../annotate/annotations.js";
+import { inFile } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { count } from "../core/format.js";
 import { on, selectedTree, state } from "../core/store.js";
@@ -63,7 +64,7 @@ function wordsOf(row, [a, b] = []) {
 }
 
 const isOfLoop = ({ kind }) => ["tie", "forbid"].includes(kind); // its positions are in the frame of the robot
-const placeText = (row) => row.places[0].map((v) => v.toFixed(1)).join(", ");
+const placeText = (row) => inFile(...row.places[0]).map((v) => v.toFixed(1)).join(", ");
 
 function lineOf(row, problem, numbers) {
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete this repair", "aria-label": `Delete repair ${row.id}`, "data-edit": true, onclick: () => removeRepair(row) });

@@ -164,8 +164,8 @@ def test_steps_are_undone_by_their_subject():
     tree = Content(1.0, 2.0)
     (id_,) = store.add(run, ANN, [tree])
     with pytest.raises(StemmapError, match="nothing to undo"):
-        store.undo(run, ANN, ["plot"])
-    store.undo(run, ANN, ["repair", "plot"])
+        store.undo(run, ANN, ["other"])
+    store.undo(run, ANN, ["repair", "other"])
     assert [row.content for row in store.annotations(run)] == [tree]
     # A new annotation leaves the repair that can be redone, and a step of both belongs to its first change.
     moved = Content(0.0, 0.0, REPAIR, None, {"kind": "move"})
@@ -177,6 +177,22 @@ def test_steps_are_undone_by_their_subject():
     assert [row.content for row in store.annotations(run)] == [Content(1.0, 2.0, "pole")]
     store.undo(run, ANN)
     assert [row.content for row in store.annotations(run)] == [tree]
+
+
+def test_an_edit_below_a_later_one_waits_for_its_undo():
+    store = ticking()
+    run = store.open_run("d", "u", "n")
+    (id_,) = store.add(run, ANN, [Content(1.0, 2.0)])
+    moved = Content(0.0, 0.0, REPAIR, None, {"kind": "move"})
+    store.edit(run, ANN, [moved], [(id_, 1, Content(3.0, 2.0))])
+    with pytest.raises(StaleError, match="later edit of yours"):
+        store.undo(run, ANN, ["tree"])
+    store.undo(run, ANN, ["repair"])
+    store.undo(run, ANN, ["tree"])
+    assert store.annotations(run) == []
+    store.redo(run, ANN, ["tree"])
+    store.redo(run, ANN, ["repair"])
+    assert Content(3.0, 2.0) in [row.content for row in store.annotations(run)]
 
 
 def test_runs_are_known_by_what_was_recorded_and_do_not_mix():

@@ -12,7 +12,7 @@ import pytest
 
 from app.dashboard.shown_run import ShownRun
 from app.worker.protocol import SetRepairs, WorkerBusyError
-from pipeline.repairs.record import Repair
+from pipeline.repairs.record import Repair, repairs_text
 from tests.app.dashboard.test_annotations import ANN, edit, show, until
 from tests.app.fakes import FakeWorker
 from tests.app.server_for_tests import BEARER, running
@@ -67,6 +67,19 @@ async def test_the_annotation_of_a_moved_tree_moves_with_it_and_back() -> None:
         await edit(client, "POST", "/redo")
         assert await trees() == [(2.6, 30.0)]
         assert len((await client.get("/api/annotations")).json()["skipped"]) == 1
+
+
+async def test_an_annotation_follows_its_tree_through_two_moves() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        x, y = dashboard.shown.frame.trees.position[0].tolist()  # type: ignore[union-attr]
+        await edit(client, "POST", x=x, y=y, kind="tree")
+        ways = (((x, y), (x, y + 30.0)), ((x, y + 30.0), (x, y + 60.0)))
+        text = repairs_text([Repair("move", places=way) for way in ways])
+        assert (await repair(client, "/import", text=text)).json()["added"] == 2
+        (row,) = (await client.get("/api/annotations")).json()["trees"]
+        assert (round(row["x"] - x, 3), round(row["y"] - y, 3)) == (0.0, 60.0)
 
 
 async def test_a_tie_stores_the_times_at_which_its_trees_were_seen() -> None:

@@ -72,12 +72,12 @@ UNIT_DOUBT = "the coordinates may be feet"
 TWICE = "stems stand twice in the cloud"
 NO_TREE = "no tree was found"
 #: Verdicts about upright objects that ground, noise or a wrong unit can also give to stems, and their fewest.
-UPRIGHT = (Verdict.POLE, Verdict.OTHER, Verdict.NO_ARC, Verdict.TOO_THIN, Verdict.TOO_THICK, Verdict.STUMP)
+UPRIGHT = (Verdict.POLE, Verdict.OTHER, Verdict.NO_ARC, Verdict.TOO_THICK, Verdict.STUMP)
 FEWEST_UPRIGHT = 3
-#: Longest shift between two passes of a scanner that is searched (spacings of plantations are wider), its
-#: precision from pair to pair, the largest difference of two diameters of a stem [m], the fewest pairs, and
-#: the largest probability that as many pairs of stems, which stand at random, have the same shift.
-SHIFT_MAX, SHIFT_SIGMA, SAME_DBH, FEWEST_PAIRS, BY_CHANCE = 0.9, 0.04, 0.04, 3, 1e-3
+#: Longest shift between two passes of a scanner that is searched (twin rows of plantations are 0.75 m apart),
+#: its precision from pair to pair, the largest difference of two diameters of a stem [m], the fewest pairs,
+#: and the largest probability that as many of the pairs of the same distance have the same direction.
+SHIFT_MAX, SHIFT_SIGMA, SAME_DBH, FEWEST_PAIRS, BY_CHANCE = 0.6, 0.04, 0.04, 3, 2e-3
 SHOWN, SHOWN_SIDE = 1 << 17, 0.02  # points of all heights that are kept, and smallest side of their cubes [m]
 
 
@@ -390,7 +390,7 @@ def _unit_doubt(about: CloudDescription, dbh: Float, above: Float32) -> list[str
         reason = f"a height of {high:.0f} m and a median DBH of {wide:.1f} m, which only giant trees have"
     else:
         return []
-    return [f"{UNIT_DOUBT}: as metres they give {reason}; name the unit with --unit ft"]
+    return [f"{UNIT_DOUBT}: as metres they give {reason}; name the unit with --unit m or --unit ft"]
 
 
 def _no_tree(verdict: Int32, up: str, ground_seen: float) -> list[str]:
@@ -437,7 +437,11 @@ def _standing_twice(place: Float, dbh: Float) -> list[str]:
     shifts = cKDTree(both)
     fullest = int(shifts.query_ball_point(shift, SHIFT_SIGMA, return_length=True).argmax())
     most = np.array(shifts.query_ball_point(shift[fullest], SHIFT_SIGMA))
-    chance = n * bdtrc(len(most) - 2.0, n - 1, 2.0 * (SHIFT_SIGMA / SHIFT_MAX) ** 2)
+    # Twin stems of a tree are all about as far apart, in directions that are random.
+    apart = np.hypot(*shift.T)
+    alike = int(np.count_nonzero(np.abs(apart - apart[fullest]) < SHIFT_SIGMA))
+    share = min(2.0 * SHIFT_SIGMA / (np.pi * max(float(apart[fullest]), SHIFT_SIGMA)), 1.0)
+    chance = n * bdtrc(len(most) - 2.0, max(alike - 1, 1), share)
     if len(most) < FEWEST_PAIRS or len(np.unique(pairs[most % n])) < 2 * len(most) or chance > BY_CHANCE:
         return []
     x, y = np.median(both[most], axis=0).tolist()

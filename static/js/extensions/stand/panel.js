@@ -15,7 +15,7 @@ import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plo
 import { reportMenu } from "./report.js";
 
 const pause = () => (state.status?.state === "playing" ? 3000 : 300); // [ms] between two requests
-const { undo, redo, canUndo, canRedo } = historyOf("plot", "frame");
+const { undo, redo, canUndo, canRedo } = historyOf("other");
 const LARGEST_FILES = 700_000; // [bytes]
 // name, label, value and bounds of the numbers of a shape; those of the server
 const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],

@@ -7,6 +7,7 @@ import pytest
 
 from app.extensions.clouds.inventory import TWICE, _no_tree, _standing_twice, _too_thin, map_plot
 from app.extensions.clouds.plot_ground import ground_steps
+from app.extensions.clouds.terrain_raster import NoiseBelow
 from app.sources.one_step import finish
 from pipeline.config import preset
 from pipeline.io.readers.cloud_frame import TURNED
@@ -58,7 +59,7 @@ def test_noise_below_a_real_plot_changes_no_ground(shared_data, name):
     assert up_by_ground(np.vstack([points, noise])[::3])[0] == "z"
 
 
-@pytest.mark.parametrize(("pairs", "is_told"), [(2, False), (3, True), (6, True)])
+@pytest.mark.parametrize(("pairs", "is_told"), [(2, False), (5, True), (8, True)])
 def test_stems_with_one_shift_stand_twice(pairs, is_told):
     rng = np.random.default_rng(3)
     place, dbh = rng.uniform(-10.0, 10.0, (14, 2)), rng.uniform(0.1, 0.4, 14)
@@ -74,7 +75,29 @@ def test_rows_and_dense_stems_stand_once():
     assert not _standing_twice(rows + rng.normal(0.0, 0.01, rows.shape), np.full(len(rows), 0.1))
     for _ in range(20):
         assert not _standing_twice(rng.uniform(-6.0, 6.0, (120, 2)), rng.uniform(0.06, 0.11, 120))
+    twin_rows = np.stack(np.meshgrid([0.0, 0.75, 3.0, 3.75], np.arange(0.0, 20.0, 1.2)), axis=-1)
+    twin_rows = twin_rows.reshape(-1, 2)
+    assert not _standing_twice(twin_rows, np.full(len(twin_rows), 0.1))
     assert not _standing_twice(np.zeros((0, 2)), np.zeros(0))
+
+
+def test_forked_stems_stand_once():
+    rng, told = np.random.default_rng(5), 0
+    for _ in range(100):
+        place, angle = rng.uniform(-60.0, 60.0, (60, 2)), rng.uniform(0.0, 2.0 * np.pi, 60)
+        twin = place + rng.uniform(0.2, 0.4, 60)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        told += bool(_standing_twice(np.vstack([place, twin]), np.full(120, 0.25)))
+    assert told <= 2
+
+
+def test_ground_that_is_hardly_seen_below_undergrowth_is_no_noise():
+    rng, size = np.random.default_rng(6), 16.0
+    places = rng.uniform(0.0, size, (64 * 15_680, 2))
+    layers = ((-0.03, 0.03, 60), (0.5, 14.0, 1620), (14.0, 25.0, 14_000))  # of ground, undergrowth, crowns
+    heights = np.concatenate([rng.uniform(low, high, 64 * n) for low, high, n in layers])
+    noise = NoiseBelow(np.zeros(2), np.full(2, size))
+    noise.add(np.column_stack([places, heights]).astype(np.float32))
+    assert noise.floor() is None
 
 
 @pytest.mark.parametrize(
