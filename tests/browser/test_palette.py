@@ -43,7 +43,7 @@ def test_the_list_of_shortcuts_names_every_key(dashboard: Dashboard):
     )
     shown = {" ": "space", "Escape": "esc"}
     assert {shown.get(key, key) for key in acting} <= set(told)
-    assert {"ctrl+k", "1", "0", "y", "n", "r", "shift+p", "ctrl+z", "←", "→", "f", "t", "b"} <= set(told)
+    assert {"ctrl+k", "1", "0", "y", "n", "r", "P", "ctrl+z", "←", "→", "f", "t", "b"} <= set(told)
     page.keyboard.press("Escape")
 
 
