@@ -7,6 +7,7 @@ columns; see `TreeRerun`. Trees act on poses only by the search of loops, which 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
@@ -21,7 +22,6 @@ from pipeline.loop_closure.detection import RunHistory
 from pipeline.slam import Loop
 from pipeline.types.records import Columns, Detections, Landmarks, PoseEstimate
 
-MOST_BYTES = 150_000_000  # of one log; ten minutes of a dense forest take about 130 MB
 #: Memory of a scan without the contents of its 20 arrays, and of these contents for each detection and for
 #: each landmark [bytes].
 SCAN_BYTES, DETECTION_BYTES, LANDMARK_BYTES = 4000, 120, 56
@@ -87,14 +87,14 @@ class TreeLog:
     """What each scan of a run gave to its trees.
 
     Args:
-        most: Memory that the log takes at most [bytes]. Beyond it, the log is empty and remains so: without
-            the first scans, the trees cannot be made from it.
+        most: Memory that the log takes at most [bytes]; inf for any. Beyond it, the log is empty and remains
+            so: without the first scans, the trees cannot be made from it.
 
     Attributes:
         nbytes: Memory that it takes, approximately [bytes].
     """
 
-    def __init__(self, most: int = MOST_BYTES) -> None:
+    def __init__(self, most: float = math.inf) -> None:
         self._scans: list[TreeInput | None] = []
         self._sizes: list[int] = []
         self._most, self.nbytes = most, 0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 _SCENE_PAUSE_S = 0.09
+#: The status of a recorder, see `Recorder.status`, with the name of its file.
+_RECORDED = re.compile(r"(?:recording|finishing|recorded) (.+), \d+ MB")
 
 
 class Dashboard:
@@ -516,9 +519,8 @@ class Dashboard:
         if self._notice and status.state == "paused":
             status = replace(status, detail=self._notice)
         self.status = status
-        word, _, rest = status.recording.partition(" ")
-        if self._record and word in ("recording", "finishing", "recorded"):
-            file = FilePath(self._record).with_name(rest.partition(",")[0])  # with a number if it existed
+        if self._record and (named := _RECORDED.match(status.recording)):
+            file = FilePath(self._record).with_name(named[1])  # with a number if the file existed
             if file not in self.recordings:
                 self.recordings.append(file)
         self.live.publish("status", status)

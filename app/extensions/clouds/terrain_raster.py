@@ -26,14 +26,15 @@ KEPT = 8  # lowest returns of a cell
 TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
 PIT = 0.5  # m; a cell this far below its neighbours is noise
 AT_ONCE = 1_000_000  # points whose heights are computed at once, to bound the memory
-#: Side of a column and height of its bins [m], and number of bins, by whose counts noise below the ground is
-#: told from it; higher points count in the bins of those 64 m below.
+#: Side of a column and height of its bins [m], and number of bins. Their counts distinguish the ground from
+#: noise below it. A point 64 m higher counts in the same bin.
 COLUMN, BIN, BINS = 2.0, 0.25, 256
 #: Share of the points of a column that is more than noise in one bin (one per cent of noise is in several),
 #: depth below this bin in which nothing but noise is, least depth of that on average [m], and least share of
 #: the bins there that noise occupies. Of real plots, the depth is 0 to 0.5 m, and 3 m and more with noise.
 DENSE, CLEARLY_BELOW, DEEP, OCCUPIED = 0.005, 1.0, 1.25, 0.05
-MOST_NOISE = 0.012  # of the points of a plot
+#: Share of the points of a plot that noise below its ground may have: one per cent, and a margin of counts.
+MOST_NOISE = 0.012
 BLOCK = 32  # columns of the raster whose neighbours are sorted at once, likewise
 
 
@@ -102,9 +103,8 @@ class TerrainRaster:
 class NoiseBelow:
     """Finds the level below which the points of a plot are noise, such as reflections of wet ground.
 
-    The lowest returns of a cell tell a few of them from the ground (see `LowestReturns`), but not as many as
-    one per cent of the points of a dense cloud. They are spread over the heights, while the ground is in few
-    bins.
+    `LowestReturns` leaves out a few noise points of a cell, but not one per cent of the points of a dense
+    cloud. Noise is spread over the heights, and the ground is in few bins.
 
     Args:
         low, high: Corners of the plot, shape (2,) [m]; points outside are ignored.
@@ -137,7 +137,7 @@ class NoiseBelow:
         is_below = (np.arange(BINS) >= 1) & (np.arange(BINS) < dense[:, None] - round(CLEARLY_BELOW / BIN))
         below = n[is_below]
         is_shallow = len(below) * BIN < DEEP * len(n) or not len(n)
-        # More than about a per cent of the points is undergrowth over ground that is hardly seen.
+        # A larger share of the points is undergrowth over ground that is hardly seen.
         is_shallow |= bool(below.sum() > MOST_NOISE * n.sum())
         if is_shallow or (share := float((below > 0.0).mean())) < OCCUPIED:
             return None

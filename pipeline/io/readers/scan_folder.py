@@ -402,17 +402,18 @@ def _have_same_steps(first: list[Pose3 | None], second: list[Pose3 | None]) -> b
     """Return whether two lists of the poses of the same scans, None for a scan without one, have the same
     steps of _STEP or more, most of them up to _STEP_SHARE of the length and _STEP_TURN; False without a
     step."""
-    both = [(a, b) for a, b in zip(first, second, strict=True) if a is not None and b is not None]
     same = list[bool]()
-    last = both[:1]
-    for a1, b1 in both:
-        a0, b0 = last[0]
-        a, b = a0.inverse() @ a1, b0.inverse() @ b1
-        if np.linalg.norm(a.t) < _STEP:
+    begin: tuple[Pose3, Pose3] | None = None
+    for now in zip(first, second, strict=True):
+        if now[0] is None or now[1] is None:
             continue
-        is_near = np.linalg.norm(a.t - b.t) < _STEP_SHARE * np.linalg.norm(a.t)
-        same.append(bool(is_near) and bool(np.abs(a.R - b.R).max() < _STEP_TURN))
-        last = [(a1, b1)]
+        begin = begin or (now[0], now[1])
+        a, b = begin[0].inverse() @ now[0], begin[1].inverse() @ now[1]
+        if (length := np.linalg.norm(a.t)) < _STEP:
+            continue
+        is_near = np.linalg.norm(a.t - b.t) < _STEP_SHARE * length
+        same.append(bool(is_near and np.abs(a.R - b.R).max() < _STEP_TURN))
+        begin = now[0], now[1]
     return bool(same) and float(np.mean(same)) > 0.5
 
 

@@ -181,11 +181,11 @@ async def test_the_recording_is_named_at_the_end(tmp_path: Path) -> None:
         port = sender.getsockname()[1]
     async with (
         serving(f"velodyne:127.0.0.1:{port}", "--record", str(file)) as server,
-        server.browser(),
+        server.browser() as (client, _),
     ):
         with socket.socket(type=socket.SOCK_DGRAM) as sender:
             async with asyncio.timeout(60):
-                while not file.is_file() or not file.stat().st_size:
+                while not (await client.get("/api/status")).json()["recording"] or not file.stat().st_size:
                     for packet in turn():
                         sender.sendto(packet, ("127.0.0.1", port))
                     await asyncio.sleep(0.1)

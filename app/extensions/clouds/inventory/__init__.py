@@ -75,9 +75,9 @@ NO_TREE = "no tree was found"
 UPRIGHT = (Verdict.POLE, Verdict.OTHER, Verdict.NO_ARC, Verdict.TOO_THICK, Verdict.STUMP)
 FEWEST_UPRIGHT = 3
 #: Longest shift between two passes of a scanner that is searched (twin rows of plantations are 0.75 m apart),
-#: its precision from pair to pair, the largest difference of two diameters of a stem [m], the fewest pairs,
-#: and the largest probability that as many of the pairs of the same distance have the same direction.
-SHIFT_MAX, SHIFT_SIGMA, SAME_DBH, FEWEST_PAIRS, BY_CHANCE = 0.6, 0.04, 0.04, 3, 2e-3
+#: its precision from pair to pair, the largest difference of two diameters of a stem [m], and the largest
+#: probability that as many of the pairs of the same distance have the same direction, which four pairs reach.
+SHIFT_MAX, SHIFT_SIGMA, SAME_DBH, BY_CHANCE = 0.6, 0.04, 0.04, 2e-3
 SHOWN, SHOWN_SIDE = 1 << 17, 0.02  # points of all heights that are kept, and smallest side of their cubes [m]
 
 
@@ -430,7 +430,7 @@ def _standing_twice(place: Float, dbh: Float) -> list[str]:
     unlike = np.abs(dbh[pairs[:, 0]] - dbh[pairs[:, 1]]) > SAME_DBH  # False where one is unknown
     pairs = pairs[~unlike]
     n = len(pairs)
-    if n < FEWEST_PAIRS:
+    if not n:
         return []
     shift = place[pairs[:, 1]] - place[pairs[:, 0]]
     both = np.concatenate([shift, -shift])  # the stems of a pair have no order
@@ -442,12 +442,13 @@ def _standing_twice(place: Float, dbh: Float) -> list[str]:
     alike = int(np.count_nonzero(np.abs(apart - apart[fullest]) < SHIFT_SIGMA))
     share = min(2.0 * SHIFT_SIGMA / (np.pi * max(float(apart[fullest]), SHIFT_SIGMA)), 1.0)
     chance = n * bdtrc(len(most) - 2.0, max(alike - 1, 1), share)
-    if len(most) < FEWEST_PAIRS or len(np.unique(pairs[most % n])) < 2 * len(most) or chance > BY_CHANCE:
+    # In a row, the second stem of a pair is the first one of the next.
+    if len(np.unique(pairs[most % n])) < 2 * len(most) or chance > BY_CHANCE:
         return []
     x, y = np.median(both[most], axis=0).tolist()
     return [
         f"{TWICE}: {len(most)} pairs are {x:.2f}, {y:.2f} m apart, so two passes of the scanner do not fit; "
-        "register them anew"
+        "register the scans again"
     ]
 
 
