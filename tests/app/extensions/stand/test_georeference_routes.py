@@ -55,7 +55,7 @@ async def test_control_points_place_the_files_as_on_the_command_line(both, tmp_p
     await look(dashboard)
     points = points_of(dashboard)
     answer = await put(client, crs="25832", how="control", points=points)
-    assert (answer.status_code, answer.json()["undo"]) == (200, {"frame": 1}), answer.text
+    assert (answer.status_code, answer.json()["undo"]) == (200, {"other": 1}), answer.text
     found = await stored(client)
     assert found is not None
     assert (found["crs"], [point["name"] for point in found["points"]]) == (UTM, ["1", "2", "post"])

@@ -91,7 +91,7 @@ async def test_the_radius_of_a_circle_is_changed_and_no_other_shape_has_one(both
 async def test_a_plot_is_added_renamed_deleted_and_all_of_it_undone(both) -> None:
     client, _ = both
     added = await act(client, "POST", plots=[CIRCLE, {**CIRCLE, "name": "north"}])
-    assert (added.status_code, added.json()["undo"]) == (201, {"plot": 1})
+    assert (added.status_code, added.json()["undo"]) == (201, {"other": 1})
     first, second = await plots(client)
     assert (first["name"], second["name"], first["shape"]["radius"]) == ("1", "north", 5.641896)
     assert (await client.get("/api/annotations")).json()["trees"] == []
