@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +15,21 @@ from numpy.typing import NDArray
 
 from app.batch.run_edits import SAME_THING
 from app.store.async_store import AsyncStore
-from app.store.records import FRAME, KINDS, REPAIR, SKIPPED, Annotation, Content, StaleError, as_truth
+from app.store.records import (
+    FRAME,
+    KINDS,
+    REPAIR,
+    SKIPPED,
+    Annotation,
+    Changed,
+    Content,
+    StaleError,
+    as_truth,
+)
 from pipeline.errors import StemmapError
-from pipeline.repairs.record import Repair, identity_of, numbers_at
+from pipeline.geometry.poses import Float
+from pipeline.repairs.record import GATE, Repair, identity_of, numbers_at
+from pipeline.repairs.trees import numbers_of, repaired_trees
 from pipeline.types.records import Trees, TruthTrees
 
 if TYPE_CHECKING:
@@ -314,35 +327,106 @@ class AnnotationEditor:
         }
 
 
-def moved_with_trees(
-    trees: Trees, rows: Sequence[Annotation], moves: Sequence[tuple[tuple[float, float], tuple[float, float]]]
+def carried_by(
+    trees: Trees, rows: Sequence[Annotation], repairs: Sequence[Repair]
 ) -> list[tuple[int, int, Content | None]]:
-    """Return the changes of the annotations of trees that are moved, by as much as their trees: id, version
-    and new content of each, see `Store.edit`.
+    """Return the changes of the annotations of trees that repairs move or merge: id, version and new content
+    of each, see `Store.edit`.
+
+    An annotation moves by as much as its tree. Of merged trees that both have an annotation, that of the tree
+    that stays is kept, unless only the other one states a class; it gets the DBH of the other one if it has
+    none and both are of one class. After a split, an annotation belongs to the nearer of both stems.
 
     Args:
-        trees: The trees before they are moved.
+        trees: The trees before the repairs.
         rows: The annotations of objects and skipped trees.
-        moves: Position of each moved tree before and after [m], in the order of the moves.
+        repairs: The repairs, in their order; those of loops change nothing here.
     """
-    placed = [(row.content.x, row.content.y) for row in rows]
-    numbers = [numbers_at(trees, [place], confirmed=True) for place in placed]
-    for start, end in moves:
-        number = numbers_at(trees, [start], confirmed=True)
-        if not number:
+    contents: dict[int, Content | None] = {row.id: row.content for row in rows}
+    tree_of = {
+        row.id: number
+        for row in rows
+        for number in numbers_at(trees, [(row.content.x, row.content.y)], confirmed=True)
+    }
+    for repair in (repair for repair in repairs if not repair.is_of_loop):
+        numbers, before = numbers_of(trees, repair), _places(trees)
+        trees, problem = repaired_trees(trees, repair, int(trees.number.max(initial=0)) + 1)
+        if problem or not numbers:
             continue
-        step = np.subtract(end, start)
-        is_moved = trees.number == number[0]
-        trees = replace(trees, position=trees.position + np.where(is_moved[:, None], step, 0.0))
-        placed = [
-            (place[0] + float(step[0]), place[1] + float(step[1])) if own == number else place
-            for place, own in zip(placed, numbers, strict=True)
-        ]
-    return [
-        (row.id, row.version, replace(row.content, x=x, y=y))
-        for row, (x, y) in zip(rows, placed, strict=True)
-        if (x, y) != (row.content.x, row.content.y)
-    ]
+        after, merged = _places(trees), repair.kind == "merge"
+        if merged:
+            contents |= _merged_contents(contents, tree_of, before, numbers)
+        for id_, number in list(tree_of.items()):
+            content, stays = contents[id_], numbers[0] if merged else number
+            if content is None or number not in numbers or stays not in after:
+                continue
+            step = after[stays] - before[number]
+            x, y = content.x + float(step[0]), content.y + float(step[1])
+            contents[id_], tree_of[id_] = replace(content, x=x, y=y), stays
+            if repair.kind == "split":
+                tree_of[id_] = next(iter(numbers_at(trees, [(x, y)], confirmed=True)), stays)
+    return [(row.id, row.version, contents[row.id]) for row in rows if contents[row.id] != row.content]
+
+
+def _places(trees: Trees) -> dict[int, Float]:
+    """Return the position of each tree by its number [m]."""
+    return dict(zip(trees.number.tolist(), trees.position, strict=True))
+
+
+def _merged_contents(
+    contents: dict[int, Content | None],
+    tree_of: dict[int, int],
+    places: dict[int, Float],
+    numbers: tuple[int, ...],
+) -> dict[int, Content | None]:
+    """Return the new contents of the annotations that count for two trees that are merged, see `carried_by`;
+    none if one tree has no annotation.
+
+    Args:
+        contents: The annotations by their id.
+        tree_of: Number of the tree of each.
+        places: Positions of the trees before they are merged [m].
+        numbers: Number of the tree that stays, and of the other one.
+    """
+    counting = list[tuple[int, Content]]()
+    for number in numbers:
+        found = [(id_, each) for id_, of in tree_of.items() if of == number and (each := contents[id_])]
+        x, y = places[number].tolist()
+        found.sort(key=lambda row: (row[1].kind == SKIPPED, math.hypot(row[1].x - x, row[1].y - y)))
+        counting += found[:1]
+    if len(counting) < 2:
+        return {}
+    (kept, content), (left, other) = sorted(counting, key=lambda row: row[1].kind == SKIPPED)
+    if content.dbh is None and content.kind == other.kind:
+        content = replace(content, dbh=other.dbh)
+    return {kept: content, left: None}
+
+
+def carried_back(repair: Repair, changes: Sequence[Changed]) -> list[tuple[int, int, Content | None]]:
+    """Return the changes of annotations with which a repair is removed, see `Store.edit`: they return to the
+    content before the repair, except for what was edited since.
+
+    Args:
+        repair: The repair.
+        changes: Changes of annotations in the step that added it, see `Store.changed_with`; other repairs of
+            that step may be the reason of some.
+    """
+    back = list[tuple[int, int, Content | None]]()
+    for row, before, after in changes:
+        # A tree is within GATE of its place in the repair, and an annotation within GATE of its tree.
+        if all(math.hypot(before.x - x, before.y - y) > 2.0 * GATE for x, y in repair.places):
+            continue
+        now = row.content
+        content = before
+        if after is not None:
+            content = replace(
+                now,
+                x=now.x + before.x - after.x,
+                y=now.y + before.y - after.y,
+                dbh=before.dbh if now.dbh == after.dbh else now.dbh,
+            )
+        back.append((row.id, row.version, content))
+    return back
 
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:

@@ -108,6 +108,11 @@ class Annotation:
     version: int
 
 
+# An annotation as it is now (of a deleted one, its last content), and its content before and after an earlier
+# change; None is deleted.
+Changed = tuple[Annotation, Content, Content | None]
+
+
 @dataclass(frozen=True, slots=True)
 class SavedSet:
     """A saved parameter set.

@@ -53,6 +53,7 @@ from app.store.records import (
     Annotation,
     Author,
     Change,
+    Changed,
     Content,
     NewRun,
     NoFilesError,
@@ -549,7 +550,8 @@ class Store:
             run: Number of the source, see `open_run`.
             author: Author of the edit.
             added: Contents of new annotations.
-            changed: Id, version and new content of each changed annotation, as in `change`.
+            changed: Id, version and new content of each changed annotation, as in `change`; a content of an
+                annotation that is deleted, at its present version, brings it back.
         """
         with self._engine.begin() as connection:
             counted = select(func.count()).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
@@ -562,7 +564,7 @@ class Store:
                 (_to_change(connection, run, id_, version, content), content)
                 for id_, version, content in changed
             ]
-            rows = [(row, content) for row, content in rows if content != _content(row)]
+            rows = [(row, content) for row, content in rows if row.deleted or content != _content(row)]
             if not added and not rows:
                 return []
             kinds = [*(content.kind for content in added), *(row.kind for row, _ in rows)]
@@ -571,6 +573,28 @@ class Store:
             for row, content in rows:
                 self._change(connection, step, author, row, content)
             return ids
+
+    def changed_with(self, id_: int) -> list[Changed]:
+        """Return the changes of other annotations in the step that added an annotation. Those that were
+        deleted are left out, unless this step has deleted them and they were not changed since.
+
+        Args:
+            id_: Identifier of the annotation.
+        """
+        added = select(_changes.c.step).where(_changes.c.annotation == id_).order_by(_changes.c.id)
+        step = added.limit(1).scalar_subquery()
+        query = select(_changes).where(_changes.c.step == step).order_by(_changes.c.id)
+        found = list[Changed]()
+        with self._engine.begin() as connection:
+            for change in connection.execute(query).all():
+                row = _row(connection, change.annotation)
+                deleted_since = row.deleted and row.made_by != change.id
+                if change.before is None or deleted_since or row.deleted != (change.after is None):
+                    continue
+                after = None if change.after is None else _as_content(change.after)
+                now = Annotation(row.id, _content(row), row.who, row.at_ns, row.version)
+                found.append((now, _as_content(change.before), after))
+        return found
 
     def undo(self, run: int, author: Author, subjects: Sequence[str] = ()) -> None:
         """Undo the last step of a browser that is not undone, with all its annotations.
@@ -665,7 +689,7 @@ class Store:
         values = {
             "step": step,
             "annotation": row.id,
-            "before": _columns(_content(row)),
+            "before": None if row.deleted else _columns(_content(row)),
             "after": None if content is None else _columns(content),
             "made_before": row.made_by,
         }
@@ -806,7 +830,7 @@ def _to_change(connection: Connection, run: int, id_: int, version: int, content
     ).one_or_none()
     if row is None or (content is not None and (content.values is None) != (row.plot is None)):
         raise UnknownError("there is no such annotation", where=f"annotation {id_}")
-    if row.version != version or row.deleted:
+    if row.version != version or (row.deleted and content is None):
         raise _stale(row)
     return row
 
@@ -838,6 +862,11 @@ def _columns(content: Content) -> dict[str, Any]:
 def _content(row: Row[Any]) -> Content:
     """Return the content of the row of an annotation."""
     return Content(row.x, row.y, row.kind, row.dbh, row.plot)
+
+
+def _as_content(columns: dict[str, Any]) -> Content:
+    """Return the content whose `_columns` these are."""
+    return Content(columns["x"], columns["y"], columns["kind"], columns["dbh"], columns["plot"])
 
 
 def _key(source: str) -> str:

@@ -13,13 +13,12 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
-from app.dashboard.annotations import Against, row_payload
+from app.dashboard.annotations import Against, carried_back, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.store.records import MOST_ANNOTATIONS, REPAIR, Content, contents_of, moment
+from app.store.records import MOST_ANNOTATIONS, REPAIR, Author, Content, contents_of, moment
 from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
 from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
-from app.web.routes.repairs import displaced
 from pipeline.errors import SourceError
 from pipeline.repairs.record import Repair, numbers_at
 
@@ -98,13 +97,17 @@ async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Re
 
 @router.delete("/annotations/{number}")
 async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
-    """Delete an annotation; with the repair that moved a tree, its annotations move back. 409 if it does not
-    have this version any more or another run was opened, 404 for an unknown one. Return its number (`id`) and
-    the counts of edits, see `edited`."""
+    """Delete an annotation; with a repair, what it did to annotations of trees is taken back. 409 if it does
+    not have this version any more or another run was opened, 404 for an unknown one. Return its number (`id`)
+    and the counts of edits, see `edited`."""
     rows = [row for row in dashboard.annotation_editor.others if row.id == number]
     repairs = [msgspec.convert(row.content.values, Repair) for row in rows if row.content.kind == REPAIR]
-    changed = [(number, body.version, None), *displaced(dashboard, repairs, back=True)]
-    await apply_edit(dashboard, body, Store.edit, [], changed)
+
+    def remove(store: Store, run: int, author: Author) -> None:
+        back = [each for repair in repairs for each in carried_back(repair, store.changed_with(number))]
+        store.edit(run, author, (), [(number, body.version, None), *back])
+
+    await apply_edit(dashboard, body, remove)
     return await edited(dashboard, body, {"id": number})
 
 

@@ -13,7 +13,7 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
-from app.dashboard.annotations import moved_with_trees
+from app.dashboard.annotations import carried_by
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.selection import NothingMappedError
 from app.store.records import REPAIR, Content
@@ -21,6 +21,7 @@ from app.store.store import Store
 from app.web.responses import BadRequestError, Number, as_bad_request, text_reply
 from app.web.routes.access import Dash, Edit, Metres, apply_edit, edited
 from pipeline.repairs.record import MOST, Kind, Repair, parse_repairs, repairs_text, seen_from
+from pipeline.repairs.trees import repaired_trees
 
 router = APIRouter(prefix="/api")
 
@@ -44,13 +45,13 @@ class _ImportRepairs(Edit):
 
 @router.post("/repairs")
 async def add(body: _AddRepair, dashboard: Dash) -> Response:
-    """Add a repair; the annotations of a moved tree move with it. Return its number (`id`) and the counts of
-    edits, see `edited`, with 201. 409 before the first map or if another run was opened meanwhile, 422 for a
-    repair that is not valid, and for a tie of a position without a tree."""
+    """Add a repair; the annotations of moved and merged trees follow. Return its number (`id`) and the counts
+    of edits, see `edited`, with 201. 409 before the first map or if another run was opened meanwhile, 422 for
+    a repair that is not valid, and for a tie of a position without a tree."""
     if len(dashboard.annotation_editor.repairs) >= MOST:
         raise BadRequestError(f"a run can have at most {MOST} repairs")
     repair = _repair(body, dashboard)
-    moved = displaced(dashboard, [repair])
+    moved = _carried(dashboard, [repair])
     (added,) = await apply_edit(dashboard, body, Store.edit, [_content(repair)], moved)
     return await edited(dashboard, body, {"id": added}, 201)
 
@@ -65,7 +66,7 @@ async def import_file(body: _ImportRepairs, dashboard: Dash) -> Response:
         if len(known) + len(new) > MOST:
             raise BadRequestError(f"a run can have at most {MOST} repairs")
     if new:
-        moved = displaced(dashboard, new)
+        moved = _carried(dashboard, new)
         await apply_edit(dashboard, body, Store.edit, [_content(repair) for repair in new], moved)
     return await edited(dashboard, body, {"added": len(new)})
 
@@ -103,23 +104,16 @@ def _repair(body: _AddRepair, dashboard: Dashboard) -> Repair:
     return repair
 
 
-def displaced(
-    dashboard: Dashboard, repairs: Sequence[Repair], *, back: bool = False
-) -> list[tuple[int, int, Content | None]]:
-    """Return the changes of the annotations of the trees that repairs move, see `moved_with_trees`; none
-    without a map.
-
-    Args:
-        dashboard: The dashboard.
-        repairs: Repairs of any kind.
-        back: Whether the repairs are removed.
-    """
+def _carried(dashboard: Dashboard, repairs: Sequence[Repair]) -> list[tuple[int, int, Content | None]]:
+    """Return the changes of the annotations with which new repairs are added, see `carried_by`; none without
+    a map. Repairs that the shown map does not have yet come first."""
     if dashboard.shown is None:
         return []
-    pairs = [repair.places for repair in repairs if repair.kind == "move"]
-    moves = [(end, start) if back else (start, end) for start, end in pairs]
-    editor = dashboard.annotation_editor
-    return moved_with_trees(dashboard.shown.frame.trees, [*editor.rows, *editor.skipped], moves)
+    editor, trees = dashboard.annotation_editor, dashboard.shown.frame.trees
+    for repair in editor.repairs:
+        if repair not in dashboard.shown.repairs and not repair.is_of_loop:
+            trees, _ = repaired_trees(trees, repair, int(trees.number.max(initial=0)) + 1)
+    return carried_by(trees, [*editor.rows, *editor.skipped], repairs)
 
 
 def _content(repair: Repair) -> Content:

@@ -13,6 +13,7 @@ import pytest
 from app.dashboard.shown_run import ShownRun
 from app.worker.protocol import SetRepairs, WorkerBusyError
 from pipeline.repairs.record import Repair, repairs_text
+from pipeline.repairs.trees import repaired_trees
 from tests.app.dashboard.test_annotations import ANN, edit, show, until
 from tests.app.fakes import FakeWorker
 from tests.app.server_for_tests import BEARER, running
@@ -80,6 +81,97 @@ async def test_an_annotation_follows_its_tree_through_two_moves() -> None:
         assert (await repair(client, "/import", text=text)).json()["added"] == 2
         (row,) = (await client.get("/api/annotations")).json()["trees"]
         assert (round(row["x"] - x, 3), round(row["y"] - y, 3)) == (0.0, 60.0)
+
+
+async def test_a_repair_that_is_removed_before_the_map_has_it_gives_the_annotation_back() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        x, y = dashboard.shown.frame.trees.position[0].tolist()  # type: ignore[union-attr]
+        await edit(client, "POST", x=x + 0.1, y=y, kind="tree", dbh_cm=30.0)
+        way = ((x, y), (x + 2.5, y))
+        assert (await repair(client, kind="move", places=way)).status_code == 201
+        # A second move, of the tree where the first one puts it, and a class that is set meanwhile.
+        assert (await repair(client, kind="move", places=[way[1], [x + 4.0, y]])).status_code == 201
+        (row,) = await trees_of(client)
+        assert (round(row["x"] - x, 3), row["version"]) == (4.1, 3)
+        fields = {"x": row["x"], "y": row["y"], "kind": "pole", "dbh_cm": 30.0}
+        await edit(client, "PATCH", f"/{row['id']}", version=row["version"], **fields)
+        for left in (2.6, 0.1):
+            newest = (await client.get("/api/annotations")).json()["others"]["repair"][-1]
+            assert (await edit(client, "DELETE", f"/{newest['id']}", version=1)).status_code == 200
+            (row,) = await trees_of(client)
+            assert (round(row["x"] - x, 3), row["kind"], row["dbh_cm"]) == (left, "pole", 30.0)
+        await edit(client, "POST", "/undo")
+        assert [round(row["x"] - x, 3) for row in await trees_of(client)] == [2.6]
+
+
+async def trees_of(client: httpx.AsyncClient) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = (await client.get("/api/annotations")).json()["trees"]
+    return rows
+
+
+async def test_merged_trees_keep_one_annotation_which_is_removed_with_the_merge() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        a, b = dashboard.shown.frame.trees.position[:2].tolist()  # type: ignore[union-attr]
+        for at, kind, dbh in ((a, "tree", None), (b, "tree", 30.0)):
+            await edit(client, "POST", x=at[0], y=at[1], kind=kind, dbh_cm=dbh)
+        before = [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)]
+        shown = dashboard.shown
+        merge = Repair("merge", places=(tuple(a), tuple(b)))
+        merged, _ = repaired_trees(shown.frame.trees, merge, 0)  # type: ignore[union-attr]
+        assert (await repair(client, kind="merge", places=[a, b])).status_code == 201
+        (row,) = await trees_of(client)
+        assert (row["x"], row["y"]) == pytest.approx(tuple(merged.position[0]), abs=1e-3)
+        assert row["dbh_cm"] == 30.0
+        for way in ("undo", "redo", "undo", "redo"):
+            await edit(client, "POST", f"/{way}")
+        (of_merge,) = (await client.get("/api/annotations")).json()["others"]["repair"]
+        version = of_merge["version"]
+        assert (await edit(client, "DELETE", f"/{of_merge['id']}", version=version)).status_code == 200
+        assert [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)] == before
+        await edit(client, "POST", "/undo")
+        assert len(await trees_of(client)) == 1
+
+
+@pytest.mark.parametrize(
+    ("of_a", "of_b", "kept"),
+    [
+        ("tree", "skipped", "tree"),
+        ("skipped", "tree", "tree"),
+        ("pole", "tree", "pole"),
+        ("", "bush", "bush"),
+    ],
+)
+async def test_the_annotation_that_states_a_class_stays_with_merged_trees(
+    of_a: str, of_b: str, kept: str
+) -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        a, b = dashboard.shown.frame.trees.position[:2].tolist()  # type: ignore[union-attr]
+        for at, kind in ((a, of_a), (b, of_b)):
+            if kind:
+                await edit(client, "POST", x=at[0], y=at[1], kind=kind)
+        assert (await repair(client, kind="merge", places=[a, b])).status_code == 201
+        answer = (await client.get("/api/annotations")).json()
+        assert [row["kind"] for row in answer["trees"]] == [kept]
+        assert answer["skipped"] == []
+
+
+async def test_annotations_stay_with_the_stems_of_a_split_tree() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        x, y = dashboard.shown.frame.trees.position[0].tolist()  # type: ignore[union-attr]
+        for away in (0.0, 0.4):
+            await edit(client, "POST", x=x + away, y=y, kind="tree")
+        split = Repair("split", places=((x, y), (x + 0.5, y)))
+        move = Repair("move", places=((x + 0.5, y), (x + 2.5, y)))
+        assert (await repair(client, "/import", text=repairs_text([split, move]))).json()["added"] == 2
+        assert [round(row["x"] - x, 3) for row in await trees_of(client)] == [0.0, 2.4]
 
 
 async def test_a_tie_stores_the_times_at_which_its_trees_were_seen() -> None:
