@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
+import random
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Position, Route, expect
+from playwright.sync_api import Browser, Position, Response, Route, expect
 
 from tests.browser.conftest import opened, opened_by_another
 from tests.browser.dashboard import Dashboard
@@ -220,6 +223,101 @@ def test_quick_answers_belong_to_the_tree_on_the_card(person: Dashboard):
     last.get_by_role("button").click()
     person.until_server("/api/annotations", f"it.trees.length + it.skipped.length === {number - 1}")
     expect(last).to_be_hidden()
+    assert person.errors == []
+
+
+# Presses keys three times per second until `wanted` answers have counted, and notes at each press which tree
+# the card shows, since when, and for which tree the page has taken it.
+REVIEWED = """async ([keys, wanted]) => {
+  const { draft } = await import('/static/js/annotate/annotations.js');
+  const evidence = document.getElementById('review-evidence'), map = document.getElementById('map');
+  let since = performance.now(), last = evidence.dataset.tree, counted = 0, undone = 0;
+  const look = new MutationObserver(() => {
+    if (evidence.dataset.tree !== last) since = performance.now();
+    last = evidence.dataset.tree;
+  });
+  look.observe(evidence, { attributes: true, attributeFilter: ['data-tree'] });
+  const given = [];
+  for (const key of keys) {
+    if (counted === wanted) break;
+    if (key === 'z' && undone >= counted) continue;
+    await new Promise((resolve) => setTimeout(resolve, 1000 / 3));
+    const title = document.getElementById('review-title').textContent, tree = Number(evidence.dataset.tree);
+    const before = draft.answer, now = performance.now();
+    const event = { key, ctrlKey: key === 'z', bubbles: true };
+    map.dispatchEvent(new KeyboardEvent('keydown', event));
+    const taken = key !== 'z' && draft.answer !== before ? draft.answer.number : null;
+    given.push({ key, title, tree, taken, seen: now - since, at: now });
+    counted += taken !== null;
+    undone += key === 'z';
+  }
+  look.disconnect();
+  return given;
+}"""
+ANSWERED = {"y": "tree", "n": "other", "s": "skipped"}
+
+
+@pytest.mark.slow
+def test_two_hundred_answers_at_three_per_second_belong_to_the_shown_trees(person: Dashboard):
+    page = person.page
+    person.open("sim:dense")
+    person.stand(40.05)
+    person.until_server("/api/trees", "it.trees.length > 140")
+    person.tab("Annotate")
+    sent: list[tuple[str, int, Any]] = []
+
+    def note(response: Response) -> None:
+        request = response.request
+        if request.method in ("POST", "PATCH") and "/api/annotations" in request.url:
+            sent.append(
+                (request.url.partition("/api/annotations")[2], response.status, request.post_data_json)
+            )
+
+    page.locator("#map").press("s")
+    person.card_shown()
+    page.on("response", note)
+    chance = random.Random(39)
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as load:
+        try:
+            given = page.evaluate(REVIEWED, [chance.choices("ynsz", k=1000), 200])
+        finally:
+            load.kill()
+    counted = [press for press in given if press["taken"] is not None]
+    edits = [press for press in given if press["taken"] is not None or press["key"] == "z"]
+    person.eventually(lambda: len(sent) == len(edits), lambda: (len(sent), len(edits)))
+
+    # What was sent is what was shown, and the store has accepted it.
+    place = {tree["number"]: (tree["x"], tree["y"]) for tree in person.ask("/api/trees")["trees"]}
+    assert all(status < 300 for _, status, _ in sent)
+    stored: dict[int, str] = {}
+    steps: list[tuple[int, str | None]] = []  # tree of each edit, and its class before
+    for press, (where, _, body) in zip(edits, sent, strict=True):
+        if press["key"] == "z":
+            assert where == "/undo"
+            tree, kind = steps.pop()
+            stored.pop(tree)
+            stored |= {} if kind is None else {tree: kind}
+            continue
+        tree = press["tree"]
+        assert press["title"] == f"Tree {tree}"
+        assert press["taken"] == tree
+        assert press["seen"] >= 150, press
+        assert (body["x"], body["y"], body["kind"]) == (*place[tree], ANSWERED[press["key"]])
+        steps.append((tree, stored.get(tree)))
+        stored[tree] = body["kind"]
+
+    # What is stored is what was sent, with the undone edits taken back.
+    answers = person.ask("/api/annotations")
+    number_of = {at: number for number, at in place.items()}
+    found = {number_of[row["x"], row["y"]]: row["kind"] for row in [*answers["trees"], *answers["skipped"]]}
+    assert found == stored
+    assert len(counted) == 200
+    took = (given[-1]["at"] - given[0]["at"]) / 1000
+    undone = len(edits) - len(counted)
+    print(
+        f"{len(given)} keys in {took:.0f} s: {len(counted)} answers stored with the tree that was shown, "
+        f"{undone} undone, {len(given) - len(edits)} not counted, {len(stored)} annotations"
+    )
     assert person.errors == []
 
 
