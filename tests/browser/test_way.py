@@ -6,9 +6,9 @@ from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
 
-# Buttons of the page that the line about the obstacle covers.
-COVERED = """() => {
-  const way = document.querySelector('#way').getBoundingClientRect();
+# Buttons of the page that the line about the obstacle, or another part of the page, covers.
+COVERED = """part => {
+  const way = document.querySelector(part).getBoundingClientRect();
   const covers = (box) => box.width
     && box.left < way.right && box.right > way.left && box.top < way.bottom && box.bottom > way.top;
   return [...document.querySelectorAll('button')].filter(node => covers(node.getBoundingClientRect()))
@@ -30,9 +30,75 @@ def test_a_person_in_the_way_is_reported(dashboard: Dashboard):
             for width, height in ((1440, 900), (1280, 720), (820, 1180), (390, 844), (1260, 720)):
                 dashboard.page.set_viewport_size({"width": width, "height": height})
                 dashboard.drawn()
-                assert dashboard.page.evaluate(COVERED) == [], f"{width} px"
+                assert dashboard.page.evaluate(COVERED, "#way") == [], f"{width} px"
         else:
             expect(way).to_be_hidden()
+
+
+# A live run that waits for its robot, with a long reason.
+SILENT = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const detail = 'Nothing heard for 12 s: robot forwarder-07 is gone; the map goes on when it is back';
+  state.status = { ...state.status, live: true, state: 'waiting', detail };
+  changed('status');
+  return document.querySelector('#notice').hidden;
+}"""
+
+
+REAL_STATUS = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.status = await (await fetch('/api/status')).json();
+  changed('status');
+}"""
+
+
+def test_a_notice_covers_no_button(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    for name in ("Trees", "Tune"):
+        dashboard.tab(name)
+        for width, height in ((1440, 900), (1280, 720), (390, 844), (1260, 720)):
+            page.set_viewport_size({"width": width, "height": height})
+            dashboard.drawn()
+            assert not page.evaluate(SILENT)
+            assert page.evaluate(COVERED, "#notice") == [], f"{name}, {width} px"
+    page.evaluate(REAL_STATUS)
+
+
+# The last status, as of a live run that has mapped something; later ones do not come in between.
+LIVE_STATUS = """async (word) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.status = { ...state.status, live: true, state: word, robot: 'red' };
+  changed('status');
+  return ['play', 'back1', 'on10', 'end-run'].map((id) => document.getElementById(id))
+    .map((node) => (node.hidden ? 'hidden' : node.disabled ? 'disabled' : 'there'));
+}"""
+END_TWICE = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.status = { ...state.status, live: true, state: 'playing' };
+  changed('status');
+  const button = document.getElementById('end-run');
+  button.click();
+  const asked = button.textContent;
+  button.click();
+  return [asked, button.textContent];
+}"""
+
+
+def test_a_live_run_is_ended_on_the_page_by_two_presses(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    expect(page.locator("#end-run")).to_be_hidden()
+    assert page.evaluate(LIVE_STATUS, "playing") == ["there", "hidden", "hidden", "there"]
+    assert page.evaluate(LIVE_STATUS, "finished") == ["disabled", "hidden", "hidden", "hidden"]
+    page.route("**/api/command", lambda route: route.fulfill(status=202, json={}))
+    with page.expect_request("**/api/command") as request:
+        assert page.evaluate(END_TWICE) == ["End it now?", "End run"]
+    assert request.value.post_data_json == {"type": "end_run"}
+    page.unroute("**/api/command")
+    page.evaluate(REAL_STATUS)
+    expect(page.locator("#end-run")).to_be_hidden()
+    expect(page.locator("#back1")).to_be_visible()
 
 
 SIGNALS = """() => {
