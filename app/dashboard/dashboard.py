@@ -518,7 +518,10 @@ class Dashboard:
         its detail."""
         if self._notice and status.state == "paused":
             status = replace(status, detail=self._notice)
+        has_ended = status.live and status.state == "finished" != self.status.state
         self.status = status
+        if has_ended:
+            self.run_recorder.finished()
         if self._record and (named := _RECORDED.match(status.recording)):
             file = FilePath(self._record).with_name(named[1])  # with a number if the file existed
             if file not in self.recordings:

@@ -52,6 +52,7 @@ class _Page:
         changes: Changes of parameters that are not written.
         writer: Task that writes the record.
         ended: Set when the run is left.
+        complete: Whether the run came to its end and its result files are not written.
     """
 
     beginning: NewRun
@@ -64,6 +65,7 @@ class _Page:
     changes: list[Change] = field(default_factory=list)
     writer: asyncio.Task[None] | None = None
     ended: asyncio.Event = field(default_factory=asyncio.Event)
+    complete: bool = False
 
 
 class RunRecorder:
@@ -150,6 +152,13 @@ class RunRecorder:
         page.changes.append(Change(revision, page.newest.shown.time_s, who, preset, changes))
         self._soon(page)
 
+    def finished(self) -> None:
+        """Write what is pending and the result files in the background, because nothing more is mapped; the
+        record stays open. Nothing without a record."""
+        if self._page is not None:
+            self._page.complete = True
+            self._soon(self._page)
+
     async def write_now(self) -> None:
         """Write what is pending of the open run, without its result files; an error of the store is only
         logged. Nothing without a run."""
@@ -173,14 +182,14 @@ class RunRecorder:
             page.writer.add_done_callback(self._tasks.discard)
 
     async def _write_on(self, page: _Page) -> None:
-        """Write the record every 5 s as long as it changes, and once more, with the result files, when the
-        run is left. What the store refuses is written with the next attempt; after the last one it is
-        lost."""
-        while page.dirty or page.changes or page.ended.is_set():
-            is_last = page.ended.is_set()
+        """Write the record every 5 s as long as it changes, with the result files when the run is complete,
+        and once more, with them, when it is left. What the store refuses is written with the next attempt;
+        after the last one it is lost."""
+        while page.dirty or page.changes or page.complete or page.ended.is_set():
+            is_last, is_complete, page.complete = page.ended.is_set(), page.complete, False
             with contextlib.suppress(StemmapError):  # the error was logged
                 await self._write(page)
-                if is_last:
+                if is_last or is_complete:
                     await self._write_files(page)
             if is_last:
                 return

@@ -344,7 +344,7 @@ class LiveSource:
             self._recorder.add_parameters(revision, from_scan, parameters.model_dump())
 
     def stop(self) -> None:
-        """End the iteration of `records`; may be called in a signal handler."""
+        """End the iteration of `records`, and the watch of the robot; may be called in a signal handler."""
         self._ending.set()
 
     def listen(self) -> bool:

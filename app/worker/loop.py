@@ -285,6 +285,8 @@ class WorkerLoop:
                 self._show(session.pause())
             case protocol.EndRecording():
                 session.end_recording()
+            case protocol.EndRun():
+                session.end_run()
             case protocol.Advance(scans=scans):
                 self._held = True
                 self._show(session.advance(scans))

@@ -131,6 +131,10 @@ class EndRecording(msgspec.Struct, frozen=True, tag="end_recording"):
     """Finish the recording of a live run, which goes on."""
 
 
+class EndRun(msgspec.Struct, frozen=True, tag="end_run"):
+    """End a live run: its recording is finished, no more scans are mapped, and the map stays."""
+
+
 class Seek(msgspec.Struct, frozen=True, tag="seek"):
     """Seek to a time [s since the first scan]; the map becomes that of this time."""
 
@@ -186,7 +190,7 @@ class WorkerBusyError(StemmapError):
     """The worker is being restarted or does not answer in time. The same command may succeed later."""
 
 
-Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open | EndRecording
+Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open | EndRecording | EndRun
 
 
 class Opened(msgspec.Struct, frozen=True, tag="opened"):

@@ -259,7 +259,8 @@ class Session:
 
     def play(self) -> Opened | None:
         """Continue the run; at its end, play from the start. A failed or closed run is opened again. Nothing
-        before the first scan of a live robot, which plays when it arrives, and if nothing was ever opened.
+        before the first scan of a live robot, which plays when it arrives, after the end of a live run, and
+        if nothing was ever opened.
 
         Returns:
             The run that was opened again, or None.
@@ -271,6 +272,8 @@ class Session:
         opened = None
         if self.run is None and self._robot is not None and self._state != "failed":
             return None  # it plays when scans arrive
+        if self._robot is not None and self._state == "finished":
+            return None
         if self.run is None or self._state == "failed":
             opened = None if self._request is None else self.open(self._request)
         elif self._state == "finished":
@@ -449,6 +452,15 @@ class Session:
         if robot is not None:
             robot.end_recording()
         return robot is not None
+
+    def end_run(self) -> None:
+        """End a live run: finish its recording and map no more scans. The state becomes "finished", and the
+        map stays until another source is opened. Nothing before the run is opened, and for other sources."""
+        if self._robot is None or self.run is None or self._state == "failed":
+            return
+        self._robot.stop()
+        self.end_recording()
+        self._state = "finished"
 
     def _is_live(self) -> bool:
         """Return whether the run is live; if so, add a warning that it cannot seek."""

@@ -59,6 +59,10 @@ class _EndRecording(Body):
     type: Literal["end_recording"]
 
 
+class _EndRun(Body):
+    type: Literal["end_run"]
+
+
 class _Advance(Body):
     type: Literal["advance"]
     scans: Annotated[int, Field(ge=-MOST_SCANS, le=MOST_SCANS)] = 1
@@ -85,7 +89,7 @@ class _SetSpeed(Body):
 
 
 _AnyCommand = Annotated[
-    _Play | _Pause | _EndRecording | _Advance | _Seek | _SetSpeed, Field(discriminator="type")
+    _Play | _Pause | _EndRecording | _EndRun | _Advance | _Seek | _SetSpeed, Field(discriminator="type")
 ]
 
 
@@ -131,7 +135,7 @@ async def status(dashboard: Dash) -> Response:
 
 @router.post("/command")
 async def command(body: _AnyCommand, dashboard: Dash) -> Response:
-    """POST /api/command: play, pause, advance, seek, set the speed, or end the recording of a live run. The
+    """POST /api/command: play, pause, advance, seek, set the speed, or end a live run or its recording. The
     response is empty (202); the status reports the result. 503 if the worker is being restarted."""
     await dashboard.command(msgspec.convert(body.model_dump(), Command))
     return json_reply({}, 202)

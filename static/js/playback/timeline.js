@@ -10,14 +10,31 @@ import { newestFirst } from "../core/timing.js";
 import { timeLink } from "./time_link.js";
 
 const ICONS = { play: "M5 3l12 7-12 7z", pause: "M5 3h4v14H5zM12 3h4v14h-4z" };
-let dragging = false;
+const STEPS = new Map([["back10", -10], ["back1", -1], ["on1", 1], ["on10", 10]]); // scans of each button
+const DOUBT = 4000; // [ms] in which a press on the button that asks again ends the run
+let dragging = false, doubting = 0;
 
 // Whether the run is on its way to a scan that takes long to reach.
 export const isGoing = (status) => Boolean(status?.going_far);
 export const playing = () => ["playing", "waiting"].includes(state.status?.state);
-const ready = () => playing() || ["paused", "finished"].includes(state.status?.state);
+const hasEnded = () => state.status?.live && state.status.state === "finished"; // of a live run, which cannot be played again
+const ready = () => playing() || (["paused", "finished"].includes(state.status?.state) && !hasEnded());
 export const togglePlay = () => ready() && send(playing() ? "pause" : "play");
 export const advance = (scans) => ready() && send("advance", { scans });
+
+// A live run of which something is mapped.
+export const canEnd = () => Boolean(state.status?.live) && state.status.scan_index >= 0 && (playing() || state.status.state === "paused");
+
+// Nothing brings an ended run back: the button asks once more.
+export function endRun() {
+  const button = byId("end-run"), isSure = doubting > 0;
+  const settle = () => { doubting = 0; setText(button, "End run"); };
+  clearTimeout(doubting);
+  settle();
+  if (isSure) return send("end_run");
+  setText(button, "End it now?");
+  doubting = setTimeout(settle, DOUBT);
+}
 
 async function send(type, fields) {
   await attempted(() => command(type, fields));
@@ -36,7 +53,9 @@ function show() {
     button.setAttribute("aria-label", name === "pause" ? "Pause" : "Play");
     button.querySelector("path").setAttribute("d", ICONS[name]);
   }
-  for (const each of document.querySelectorAll(".buttons button")) each.disabled = !ready() || (status.live && each !== button);
+  for (const id of STEPS.keys()) byId(id).hidden = status.live;
+  for (const each of [button, ...[...STEPS.keys()].map(byId)]) each.disabled = !ready();
+  byId("end-run").hidden = !canEnd();
   const line = byId("timeline");
   line.disabled = !(status.end_s > 0);
   if (!dragging && !seek.isBusy()) {
@@ -129,9 +148,8 @@ function showPreset() {
 export function startTimeline() {
   byId("preset-fit").addEventListener("click", () => attempted(() => post("/api/parameters/preset", { name: state.parameters.unsuited })));
   byId("play").addEventListener("click", togglePlay);
-  for (const [id, scans] of [["back10", -10], ["back1", -1], ["on1", 1], ["on10", 10]]) {
-    byId(id).addEventListener("click", () => advance(scans));
-  }
+  for (const [id, scans] of STEPS) byId(id).addEventListener("click", () => advance(scans));
+  byId("end-run").addEventListener("click", endRun);
   const line = byId("timeline");
   line.addEventListener("input", () => {
     dragging = true;

@@ -11,6 +11,7 @@ import { state, trees } from "../core/store.js";
 import { openStory } from "../explain/story.js";
 import { connectRobot, openSources } from "../open/dialog.js";
 import { chooseView, toggleLayer } from "../scene/layers.js";
+import { canEnd, endRun } from "../playback/timeline.js";
 import { openParameter } from "../tune/panel.js";
 import { attempt, isChanged, savedSets, shown, specOf, tuning, use } from "../tune/parameters.js";
 import { openDrawer, toTab } from "./actions.js";
@@ -59,6 +60,7 @@ const panels = () => [
   ["Upload a recording", "", edits(async () => { await openSources(); byId("upload-choose").focus(); })],
   ["Connect a robot or a sensor", "", edits(connectRobot)],
   ...(isRecording() ? [["End the recording; the run goes on", "", endRecording, "stop finish live"]] : []),
+  ...(canEnd() ? [["End the live run; its map stays", "", edits(() => { byId("end-run").focus(); endRun(); }), "stop finish mapping robot"]] : []),
   ["Topics and mounting of a recording or robot", "", edits(async () => { await openSources(); byId("source-uri").value ||= state.status?.source ?? ""; byId("source-inside").open = true; })],
   ...(byId("warnings-button").hidden ? [] : [["Show the warnings", "", () => byId("warnings-button").click()]]),
 ];

@@ -19,6 +19,7 @@ class RefusingStore:
     def __init__(self, refusals: int) -> None:
         self.refusals = refusals
         self.written: list[Any] = []
+        self.files: list[int] = []
 
     async def ask(self, function: Any) -> Any:
         if self.refusals:
@@ -29,8 +30,8 @@ class RefusingStore:
     def update(self, _record: int, _figures: Any) -> None:
         pass
 
-    def put_files(self, _record: int, _files: bytes) -> None:
-        pass
+    def put_files(self, record: int, _files: bytes) -> None:
+        self.files.append(record)
 
     def revise_all(self, _record: int, changes: list[Any]) -> None:
         self.written += changes
@@ -60,3 +61,18 @@ def test_parameter_changes_that_the_store_refuses_are_written_later(refusals, mo
 
     asyncio.run(drive())
     assert [change.revision for change in store.written] == [1, 2]
+
+
+def test_the_result_files_of_a_live_run_are_written_when_it_ends(monkeypatch):
+    monkeypatch.setattr(run_recorder, "_PAUSE_S", 0.0)
+    store = RefusingStore(0)
+
+    async def drive() -> None:
+        recorder = recorder_of(store)
+        recorder.finished()
+        await asyncio.gather(*recorder._tasks)
+        assert store.files == [1]
+        await recorder.close()
+
+    asyncio.run(drive())
+    assert store.files == [1, 1]  # what people have added since is in the second ones

@@ -16,7 +16,20 @@ from app.robot.source import LiveSource
 from app.robot.topics import Publisher
 from app.sources.live_address import ZenohAddress, parse_address
 from app.worker.loop import WorkerLoop
-from app.worker.protocol import Advance, Begin, FromWorker, Open, Opened, Pause, Report, Seek, Shown, ToWorker
+from app.worker.protocol import (
+    Advance,
+    Begin,
+    EndRun,
+    FromWorker,
+    Open,
+    Opened,
+    Pause,
+    Play,
+    Report,
+    Seek,
+    Shown,
+    ToWorker,
+)
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
@@ -192,6 +205,31 @@ def test_a_live_run_can_be_paused_and_not_stepped(sending):
         until(lambda: any("open its recording" in warning for warning in on.status.warnings))
         sending(link, 11, SCANS)
         assert on.shown[-1] == 10
+
+
+def test_an_ended_run_has_its_recording_and_keeps_its_map(sending, tmp_path: Path):
+    with stage() as on:
+        on.commands.put(Open(URI, record=str(tmp_path / "run.mcap")))
+        until(lambda: on.links)
+        link = on.links[0]
+        announce(link, sending)
+        until(lambda: link.channels)
+        sending(link, 0, 11)
+        until(on.opened)
+        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
+        until(lambda: on.shown and on.shown[-1] == 10)
+        on.commands.put(EndRun())
+        until(lambda: on.status.state == "finished")
+        assert on.status.live
+        assert not on.status.recording.startswith("recording")
+        assert recorded_scans(tmp_path / "run.mcap") == 11
+        sending(link, 11, SCANS)
+        on.commands.put(Play())  # an ended run stays ended
+        on.commands.put(Pause())
+        until(on.commands.empty)
+        until(lambda: on.status.state == "finished")
+        assert on.shown[-1] == 10
+    assert recorded_scans(tmp_path / "run.mcap") == 11
 
 
 def recorded_scans(path: Path) -> int:
