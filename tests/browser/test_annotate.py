@@ -722,7 +722,8 @@ def test_picture_question_and_answers_are_in_view_together(person: Dashboard):
     page.locator("#map").press("s")
     person.card_shown()
     parts = ["#review-evidence .picture:has(.fit)", "#annotate-hint", "#annotate-yes", "#annotate-no"]
-    parts += ["#annotate-next", "#annotate-kind", "#review-title"]
+    parts += ["#annotate-next", "#annotate-kind", "#review-title", "#annotate-asked"]
+    title = page.locator("#review-title").inner_text()
     for width, height in ((1440, 900), (1280, 720), (390, 844)):
         page.set_viewport_size({"width": width, "height": height})
         person.drawn()
@@ -738,6 +739,7 @@ def test_picture_question_and_answers_are_in_view_together(person: Dashboard):
             assert box["y"] + box["height"] <= bottom["y"] + 0.5, (width, part, box, bottom)
             assert box["x"] >= 0, (width, part, box)
             assert box["x"] + box["width"] <= width + 0.5, (width, part, box)
+        assert page.locator("#review-title").inner_text() == title, width
 
 
 def test_an_import_says_how_many_trees_of_the_map_it_confirms(person: Dashboard):
