@@ -1,6 +1,6 @@
 // The tab Annotate: review of the found trees, the list of annotations, and the keys of the tab.
 
-import { placeTexts } from "../core/coordinates.js";
+import { placeTexts, unitNode } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { count, dbhText, figure, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
@@ -58,7 +58,7 @@ function build() {
       el("p", { id: "annotate-warned", class: "note warned", role: "status" })),
     el("div", { class: "annotate-list" },
       el("table", { id: "annotations", class: "plain" }, el("thead", {}, el("tr", {},
-        ...["tree", "class", "DBH cm", "x m", "y m", "by"].map((text) => el("th", { scope: "col", text })), el("td"))), el("tbody"))),
+        ...[["tree"], ["class"], ["DBH cm"], ["x ", unitNode()], ["y ", unitNode()], ["by"]].map((parts) => el("th", { scope: "col" }, ...parts)), el("td"))), el("tbody"))),
     el("div", { class: "annotate-files" },
       el("label", {}, "Name ", nameField("annotate-name")),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,

@@ -1,6 +1,6 @@
 // Annotating by pointer: on the 2D map a click adds or chooses and dragging moves; in the 3D scene Shift+click adds.
 
-import { inFile } from "../core/coordinates.js";
+import { inFile, unitWord } from "../core/coordinates.js";
 import { fixed } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
@@ -104,7 +104,7 @@ function drawPlace(pen, view, { x, y, on, at }) {
   pen.lineTo(px, py);
   pen.stroke();
   const left = px > view.width - 120;
-  drawText(pen, on ? `snaps to ${on}` : `${inFile(x, y).map((value) => fixed(value, 2)).join(", ")} m`, px + (left ? -14 : 14), py - 10, { font: "12px", align: left ? "right" : "left" });
+  drawText(pen, on ? `snaps to ${on}` : `${inFile(x, y).map((value) => fixed(value, 2)).join(", ")} ${unitWord()}`, px + (left ? -14 : 14), py - 10, { font: "12px", align: left ? "right" : "left" });
 }
 
 // --- in the scene ------------------------------------------------------------------------------------

@@ -21,16 +21,17 @@ export const treeAt = (trees, [px, py], view) => nearest(trees, (tree) => {
   return Math.hypot(px - x, py - y) - symbolRadius(tree, view.scale);
 }, TREE_REACH);
 
-// Grid, scale bar and coordinates around what `paint` draws. `offset` is that of the map in the coordinates that are shown [m].
-export function drawFrame(pen, view, paint, offset = [0, 0]) {
-  const labels = drawGrid(pen, view, offset);
+// Grid, scale bar and coordinates around what `paint` draws. `frame` is that of the coordinates that are shown:
+// offset of the map in it [m], and its unit in metres and as text.
+export function drawFrame(pen, view, paint, frame = { offset: [0, 0], metres: 1, word: "m" }) {
+  const labels = drawGrid(pen, view, frame);
   paint();
   for (const [text, x, y, align] of labels) drawText(pen, text, x, y, { font: "10.5px", align, colour: colours.axis });
   drawScaleBar(pen, view);
 }
 
 // `isRejected` tells whether a person rejected a found tree.
-export const drawMap = (pen, view, state, isRejected, offset) => drawFrame(pen, view, () => drawContent(pen, view, state, isRejected), offset);
+export const drawMap = (pen, view, state, isRejected, frame) => drawFrame(pen, view, () => drawContent(pen, view, state, isRejected), frame);
 
 function drawContent(pen, view, state, isRejected) {
   drawLine(pen, view, alignedOdometry(state), colours.odometry, 1.2);
@@ -68,30 +69,31 @@ const FEW_DIGITS = 10_000; // [m]; labels of larger coordinates count from a who
 const originOf = (coordinate) => (Math.abs(coordinate) < FEW_DIGITS ? 0 : 1000 * Math.floor(coordinate / 1000));
 
 // Returns the coordinates of the lines as [text, x, y, alignment], which are drawn above the content.
-function drawGrid(pen, view, offset) {
-  const origin = [originOf(view.x + offset[0]), originOf(view.y + offset[1])];
+function drawGrid(pen, view, { offset, metres, word }) {
+  const inFile = (value, axis) => (value + offset[axis]) / metres, inMap = (value, axis) => value * metres - offset[axis];
+  const origin = [originOf(inFile(view.x, 0)), originOf(inFile(view.y, 1))];
   const lowest = view.height - (origin.some(Boolean) ? 34 : 22); // [px]
-  const label = (value, axis) => fixed(value + offset[axis] - origin[axis], decimals);
-  const labels = [], step = view.step();
+  const label = (value, axis) => fixed(value - origin[axis], decimals);
+  const labels = [], step = view.step(metres), first = (value, axis) => Math.ceil(inFile(value, axis) / step) * step;
   const [x0, y0] = view.toMap(0, view.height);
   const [x1, y1] = view.toMap(view.width, 0);
   const decimals = Math.max(0, -Math.floor(Math.log10(step)));
   Object.assign(pen, { strokeStyle: colours.grid, lineWidth: 1 });
   pen.beginPath();
-  for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) {
-    const px = Math.round(view.toScreen(x, 0)[0]) + 0.5;
+  for (let x = first(x0, 0); x <= inFile(x1, 0); x += step) {
+    const px = Math.round(view.toScreen(inMap(x, 0), 0)[0]) + 0.5;
     pen.moveTo(px, 0);
     pen.lineTo(px, view.height);
     if (px > 30 && px < view.width - 120) labels.push([label(x, 0), px, view.height - 6, "center"]);
   }
-  for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
-    const py = Math.round(view.toScreen(0, y)[1]) + 0.5;
+  for (let y = first(y0, 1); y <= inFile(y1, 1); y += step) {
+    const py = Math.round(view.toScreen(0, inMap(y, 1))[1]) + 0.5;
     pen.moveTo(0, py);
     pen.lineTo(view.width, py);
     if (py > 24 && py < lowest) labels.push([label(y, 1), 5, py - 3, "left"]);
   }
   pen.stroke();
-  if (origin.some(Boolean)) labels.push([`+ ${origin.join(", ")} m`, 5, view.height - 20, "left"]);
+  if (origin.some(Boolean)) labels.push([`+ ${origin.join(", ")} ${word}`, 5, view.height - 20, "left"]);
   return labels;
 }
 

@@ -3,7 +3,7 @@
 import { annotating, draft, reviewOf, rows as annotations } from "../annotate/annotations.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "../annotate/pointer.js";
 import { drawSection } from "../annotate/section.js";
-import { inFile, offset } from "../core/coordinates.js";
+import { fileFrame, inFile, isMetric } from "../core/coordinates.js";
 import { byId, setText } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
 import { dbhText, heightText, NONE, seenText } from "../core/format.js";
@@ -32,7 +32,7 @@ const map = new MapCanvas(canvas, {
   describe,
   paint(pen, view) {
     drawSection(pen, view);
-    drawMap(pen, view, state, isRejected, offset());
+    drawMap(pen, view, state, isRejected, fileFrame());
     ofExtensions("drawOnMap", pen, view);
     drawAnnotations(pen, view);
     drawRepairs(pen, view);
@@ -82,7 +82,7 @@ function describe(at) {
 function tableOfMap() {
   const found = trees().map((tree) => ["tree", tree.number, ...inFile(tree.x, tree.y), tree.dbh_cm]);
   const truth = (state.truth ?? []).map(({ kind, x, y, dbh_cm: dbh }) => [`truth: ${kind}`, null, ...inFile(x, y), dbh]);
-  return [["what", "number", "x_m", "y_m", "dbh_cm"], ...found, ...truth, ...state.path.map(([x, y], scan) => ["path", scan, ...inFile(x, y), null])];
+  return [["what", "number", ...(isMetric() ? ["x_m", "y_m"] : ["x", "y"]), "dbh_cm"], ...found, ...truth, ...state.path.map(([x, y], scan) => ["path", scan, ...inFile(x, y), null])];
 }
 
 // The centre of the tree at a point of the canvas, else the point itself [m].

@@ -50,9 +50,9 @@ class MapView {
     this.moved = true;
   }
 
-  // Step of the grid [m]: 1, 2 or 5 times a power of ten, at least 55 pixels.
-  step() {
-    const least = 55 / this.scale;
+  // Step of the grid in units of so many metres: 1, 2 or 5 times a power of ten, at least 55 pixels.
+  step(metres = 1) {
+    const least = 55 / this.scale / metres;
     const power = 10 ** Math.floor(Math.log10(least));
     return [1, 2, 5, 10].map((k) => k * power).find((step) => step >= least);
   }

@@ -1,7 +1,7 @@
 // The tab Repair: tools for trees and loops, and the list of repairs.
 
 import { draft, historyOf } from "../annotate/annotations.js";
-import { inFile } from "../core/coordinates.js";
+import { inFile, unitWord } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { count } from "../core/format.js";
 import { on, selectedTree, state } from "../core/store.js";
@@ -68,7 +68,7 @@ const placeText = (row) => inFile(...row.places[0]).map((v) => v.toFixed(1)).joi
 
 function lineOf(row, problem, numbers) {
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete this repair", "aria-label": `Delete repair ${row.id}`, "data-edit": true, onclick: () => removeRepair(row) });
-  return el("li", { "data-repair": row.id, class: problem ? "problem" : "", title: isOfLoop(row) ? "" : `at ${placeText(row)} m` },
+  return el("li", { "data-repair": row.id, class: problem ? "problem" : "", title: isOfLoop(row) ? "" : `at ${placeText(row)} ${unitWord()}` },
     el("span", { class: "grow" }, wordsOf(row, problem ? [] : numbers), ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
     el("span", { class: "dim", text: row.who }), gone);
 }

@@ -5,6 +5,7 @@ import { startAnnotatePanel } from "../annotate/panel.js";
 import { startSceneAnnotating } from "../annotate/pointer.js";
 import { startClusters } from "../clusters/clusters.js";
 import { showProblem } from "../core/problem.js";
+import { startUnits } from "../core/coordinates.js";
 import { connect } from "../core/live_feed.js";
 import { startTheme } from "../core/theme.js";
 import { startStory } from "../explain/story.js";
@@ -41,6 +42,6 @@ import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startLayout, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startRepairPanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startWelcome, startShare, startExtensions]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startWelcome, startShare, startUnits, startExtensions]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

@@ -4,7 +4,7 @@ import { reviewOf } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
-import { placeTexts } from "../core/coordinates.js";
+import { placeTexts, unitNode } from "../core/coordinates.js";
 import { count, dbhFigure, figure, fixed, heightFigure, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
@@ -26,8 +26,8 @@ const MARKS = { open: "", confirmed: " ✓", rejected: " ✕", skipped: " ↷" }
 // key, title, tooltip, text, value for sorting (null if unknown), and whether it is shown only without a drive (true) or with one (false)
 const COLUMNS = [
   ["number", "tree", "Number of the tree; ✓ confirmed, ✕ rejected, ↷ skipped in the review", (t) => `${t.number}${MARKS[reviewOf(t)]}`, (t) => t.number],
-  ["x", "x m", "x as in the files: of a drive in the frame of the map, along the first heading", (t) => placeTexts([t.x, t.y])[0], (t) => t.x],
-  ["y", "y m", "y as in the files: of a drive in the frame of the map, to the left of the first heading", (t) => placeTexts([t.x, t.y])[1], (t) => t.y],
+  ["x", "x", "x as in the files: of a drive in the frame of the map, along the first heading", (t) => placeTexts([t.x, t.y])[0], (t) => t.x],
+  ["y", "y", "y as in the files: of a drive in the frame of the map, to the left of the first heading", (t) => placeTexts([t.x, t.y])[1], (t) => t.y],
   ["sigma", "position ± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
   ["dbh", "DBH cm", "Diameter at breast height ± its standard deviation", (t) => dbhFigure(t.dbh_cm, t.sigma_dbh_cm), (t) => t.dbh_cm],
   ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or it was not seen", (t) => heightFigure(t.height_m, t.sigma_height_m), (t) => t.height_m, true],
@@ -46,7 +46,7 @@ function sigmaText(tree) {
 
 function head() {
   const cells = COLUMNS.map(([key, title, hint]) => el("th", { scope: "col", "data-key": key },
-    el("button", { text: title, title: hint, onclick: () => sortBy(key) })));
+    el("button", { title: hint, onclick: () => sortBy(key) }, title, ...(["x", "y"].includes(key) ? [" ", unitNode()] : []))));
   byId("trees").tHead.replaceChildren(el("tr", {}, ...cells));
   markOrder();
 }

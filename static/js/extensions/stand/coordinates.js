@@ -2,7 +2,7 @@
 // of the map. Files, plots and the report have it then.
 
 import { draft, edit, news, remove, send } from "../../annotate/annotations.js";
-import { offset } from "../../core/coordinates.js";
+import { inFile, inMap, unitNode } from "../../core/coordinates.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
 import { count, fixed, NONE } from "../../core/format.js";
 import { on, selectedTree, state, treeOf } from "../../core/store.js";
@@ -11,7 +11,7 @@ import { draw, plotting, sketch } from "./plots.js";
 const HOW = { control: "control points", gnss: "GNSS fixes of the recording", hand: "values by hand", file: "coordinates of the file, already in the system" };
 const HAND = [["east", "east m", "East of the map's origin, m"], ["north", "north m", "North of the map's origin, m"],
   ["turn_deg", "turn °", "Angle of the map's x axis from east to north, °"], ["z", "height m", "Height of the map's zero, m"]];
-const COLUMNS = [["name", "point", "Name of the point"], ["x", "x m", "x in the coordinates of the files"], ["y", "y m", "y in the coordinates of the files"], ["east", "east m", "East in the reference system"],
+const COLUMNS = [["name", "point", "Name of the point"], ["x", "x", "x in the coordinates of the files"], ["y", "y", "y in the coordinates of the files"], ["east", "east m", "East in the reference system"],
   ["north", "north m", "North in the reference system"], ["z", "height m", "Height in the reference system; may be empty"]];
 const PLACE = ["x", "y"];
 const POINT_SIGMA = 0.125; // m, that of the command line
@@ -132,15 +132,16 @@ function fillResiduals() {
 }
 
 function cell(point, row, name, title) {
-  const axis = PLACE.indexOf(name), by = offset()[axis] ?? 0;
+  const axis = PLACE.indexOf(name);
   const known = number((point.tree === null ? point : treeOf(point.tree))?.[name] ?? "");
-  if (point.tree !== null && axis >= 0) return el("td", { text: fixed(known === null ? null : known + by, 3) });
-  const value = axis < 0 ? point[name] : known === null ? "" : (known + by).toFixed(3);
+  const written = axis < 0 || known === null ? null : inFile(known, known)[axis];
+  if (point.tree !== null && axis >= 0) return el("td", { text: fixed(written, 3) });
+  const value = axis < 0 ? point[name] : written === null ? "" : written.toFixed(3);
   return el("td", {}, el("input", { name, value: String(value ?? ""), title, type: name === "name" ? "text" : "number", step: "any", maxlength: "60", autocomplete: "off", "aria-label": `${title} of point ${row + 1}`,
     placeholder: name === "name" ? titleOf({ ...point, name: "" }, row) : null,
     oninput: (event) => {
       const typed = number(event.target.value);
-      point[name] = axis < 0 ? event.target.value : typed === null ? "" : typed - by;
+      point[name] = axis < 0 ? event.target.value : typed === null ? "" : inMap(typed, typed)[axis];
       dirty = true;
       fillResiduals();
       news();
@@ -149,7 +150,7 @@ function cell(point, row, name, title) {
 
 function fillTable() {
   const table = byId("control-points");
-  table.tHead.replaceChildren(el("tr", {}, ...COLUMNS.map(([, text, title]) => el("th", { scope: "col", text, title })), el("th", { scope: "col", text: "residual E, N cm", title: "Known position minus that of the map by the best fit of all points: east, north" }), el("td")));
+  table.tHead.replaceChildren(el("tr", {}, ...COLUMNS.map(([name, text, title]) => el("th", { scope: "col", title }, text, ...(PLACE.includes(name) ? [" ", unitNode()] : []))), el("th", { scope: "col", text: "residual E, N cm", title: "Known position minus that of the map by the best fit of all points: east, north" }), el("td")));
   table.tBodies[0].replaceChildren(...points.map((point, row) => el("tr", {}, ...COLUMNS.map(([name, , title]) => cell(point, row, name, title)),
     el("td", { class: "residual" }),
     el("td", {}, el("button", { type: "button", class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete point ${row + 1}`, onclick: () => { points.splice(row, 1); changed(); } })))));

@@ -2,7 +2,7 @@
 
 import { draft, historyOf, remove, reviewOf, rows as annotations, STATES, treeNumberOf } from "../../annotate/annotations.js";
 import { get } from "../../core/api.js";
-import { inMap, offset } from "../../core/coordinates.js";
+import { inFile, inMap, unitNode } from "../../core/coordinates.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
 import { nothingYet } from "../../core/empty_state.js";
 import { count, figure, percent, plusMinus, withSigma } from "../../core/format.js";
@@ -63,7 +63,7 @@ function typed() {
     const form = event.target;
     const [x, y] = inMap(numberOf(form, "x"), numberOf(form, "y"));
     addPlots([{ name: form.elements.name.value.trim(), shape: { kind: kind.value, x, y, ...Object.fromEntries(FIELDS[kind.value].map(([name]) => [name, numberOf(form, name)])) } }]);
-  } }, kind, el("label", {}, "x m", number("x", 0, "x of the centre in the coordinates of the files, m")), el("label", {}, "y m", number("y", 0, "y of the centre in the coordinates of the files, m")), fields,
+  } }, kind, el("label", {}, "x ", unitNode(), number("x", 0, "x of the centre in the coordinates of the files")), el("label", {}, "y ", unitNode(), number("y", 0, "y of the centre in the coordinates of the files")), fields,
   el("label", {}, "name", el("input", { type: "text", name: "name", maxlength: "60", placeholder: "next number", autocomplete: "off" })), el("button", { class: "small", text: "Add" }));
 }
 
@@ -240,7 +240,7 @@ function resetFields() {
   if (!now || now === run) return;
   if (run) draft.error = "";
   run = now;
-  offset().forEach((value, axis) => { document.querySelector(`#plots-edit [name=${["x", "y"][axis]}]`).defaultValue = value; });
+  inFile(0, 0).forEach((value, axis) => { document.querySelector(`#plots-edit [name=${["x", "y"][axis]}]`).defaultValue = value; });
   for (const form of document.querySelectorAll("#plots-edit form")) form.reset();
   byId("plot-crs").value = "";
   for (const { node } of lines.values()) node.remove();
