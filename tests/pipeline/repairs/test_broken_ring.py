@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,34 +13,11 @@ from pipeline.geometry.poses import Pose2
 from pipeline.repairs.record import Kind, Repair, parse_repairs, repairs_text, seen_from
 from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer, _joined
 from pipeline.types.records import Float
-from tests.benchmarks.wide_ring import NS, WideRing, mapped
+from tests.benchmarks.broken_ring import DOUBLE, GHOSTS, POLES, TWIN, FaultyRing
+from tests.benchmarks.wide_ring import NS, mapped
 from tests.pipeline import strategies
 
 STEMS = preset("stems")
-POLES = np.array([[8.0, 3.0], [16.0, -2.5], [22.0, 10.0]])
-GHOSTS = np.array([[3.0, -3.0], [14.0, 6.5]])
-TWIN = np.array([0.2, 0.1])  # m, between two stems that are one in the map
-DOUBLE = np.array([0.9, 0.0])  # m, between a stem and its false copy
-CLEAR = 2.0  # m, of other stems around each fault
-
-
-@dataclass(frozen=True, slots=True)
-class FaultyRing(WideRing):
-    """A ring with poles, ghosts, two false copies of trees, and a tree with a twin."""
-
-    def scene(self, random: np.random.Generator) -> tuple[Float, Float, Float]:
-        """Return the true trees, those with a false copy, and the one with a twin."""
-        trees = WideRing.trees(self, random)
-        away = np.hypot(*(trees[:, None] - np.concatenate([POLES, GHOSTS])[None]).transpose(2, 0, 1))
-        trees = trees[away.min(axis=1) > CLEAR]
-        apart = np.hypot(*(trees[:, None] - trees[None]).transpose(2, 0, 1)) + 9.0 * np.eye(len(trees))
-        on_way = np.abs(np.hypot(trees[:, 0], trees[:, 1] - self.radius) - self.radius)
-        lone = np.flatnonzero((apart.min(axis=1) > CLEAR) & (on_way > CLEAR) & (trees[:, 0] > 5.0))
-        return trees, trees[lone[:2]], trees[lone[2]]
-
-    def trees(self, random: np.random.Generator) -> Float:
-        trees, copied, twin = self.scene(random)
-        return np.concatenate([trees, copied + DOUBLE, (twin + TWIN)[None], POLES, GHOSTS])
 
 
 @cache
