@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import re
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 _SCENE_PAUSE_S = 0.09
 #: The status of a recorder, see `Recorder.status`, with the name of its file.
-_RECORDED = re.compile(r"(?:recording|finishing|recorded) (.+), \d+ MB")
 
 
 class Dashboard:
@@ -96,7 +94,6 @@ class Dashboard:
         self.camera = CameraView(self.worker_client)
         self.selector = Selector(self)
         self.source = SourceRequest("")
-        self._record = ""  # file that was named for the recording of the run
         self.recordings: list[FilePath] = []
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
@@ -227,7 +224,6 @@ class Dashboard:
         source = command.request()
         self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self.run, self.source, self.digest = None, source, ""
-        self._record = command.record
         self.live.publish("source", source.for_page())
         self.camera.forget()
         self.run_recorder.leave()
@@ -522,10 +518,8 @@ class Dashboard:
         self.status = status
         if has_ended:
             self.run_recorder.finished()
-        if self._record and (named := _RECORDED.match(status.recording)):
-            file = FilePath(self._record).with_name(named[1])  # with a number if the file existed
-            if file not in self.recordings:
-                self.recordings.append(file)
+        if status.recorded_file and (file := FilePath(status.recorded_file)) not in self.recordings:
+            self.recordings.append(file)
         self.live.publish("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
             self._broadcast_events()

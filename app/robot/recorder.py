@@ -81,6 +81,11 @@ class Recorder:
             word = "finishing" if self._thread.is_alive() else "recorded"
         return f"{word} {self.path.name}, {self._file.tell() / 1e6:.0f} MB{missing}"
 
+    @property
+    def begun(self) -> bool:
+        """Whether the file has a beginning; it stays after the run."""
+        return self._thread is not None
+
     def begin(self, channels: Sequence[Channel], header: Mapping[str, Any], robot: str) -> None:
         """Write the beginning of the file and start the thread. A second call, and one after `close`, does
         nothing; a disk error ends the recording, see `problem`.

@@ -306,6 +306,11 @@ class LiveSource:
         """State of the recording in one line, "" if there is none."""
         return "" if self._recorder is None else self._recorder.status
 
+    @property
+    def recorded_file(self) -> str:
+        """Path of the file of the recording, "" if there is none."""
+        return str(self._recorder.path) if self._recorder is not None and self._recorder.begun else ""
+
     def mapped(self, frame: Frame, path: Path, also: Mapping[str, bytes] | None = None) -> None:
         """Publish and record the results of a scan, and store its picture if one is due. Path and trees are
         published and recorded at most once per second. Nothing happens without publishing, recording and

@@ -72,6 +72,7 @@ class Status:
             no rerun.
         camera: Whether the source has camera pictures.
         recording: State of the recording of a live run; empty if there is none.
+        recorded_file: Path of its file; empty if there is none.
         one_step: What is known of a source that is mapped in one step; None for a run of scans.
         storage: What a run of scans keeps; None without one.
     """
@@ -103,6 +104,7 @@ class Status:
     robot: str = ""
     robots: list[str] = field(default_factory=list)
     recording: str = ""
+    recorded_file: str = ""
     camera: bool = False
     remapped: float | None = None
     compiling_since_s: float | None = None

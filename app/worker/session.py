@@ -514,6 +514,7 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
         robots=robot.robots,
         scans_behind=robot.scans_waiting,
         recording=robot.recording,
+        recorded_file=robot.recorded_file,
     )
 
 
