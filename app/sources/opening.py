@@ -1,9 +1,9 @@
 """Opening of files from outside, and questions about files and robots, in child processes with limits on
 memory, computing time, time and output.
 
-A damaged or hostile file can take gigabytes, hang, or end the process that opens it. `open_source` and
-`open_cloud` open it first in a copy of this process, with limits that grow with the size of the file. `ask`
-starts `app.dashboard.inspection_process` for the server, which does not import what only that process needs.
+A damaged or hostile file can take gigabytes, hang, or end the process that opens it. `open_source` opens it
+first in a copy of this process, with limits that grow with the size of the file. `ask` starts
+`app.dashboard.inspection_process` for the server, which does not import what only that process needs.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 from weakref import WeakKeyDictionary
 
 import msgspec
@@ -41,10 +41,6 @@ from pipeline.io.readers import (
 from pipeline.io.readers import is_cloud as _is_cloud
 from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
-
-if TYPE_CHECKING:
-    from pipeline.types.records import WholeCloud
-
 
 _PR_SET_PDEATHSIG = 1
 _DAMAGED = "The file is damaged, or this is a fault in stemmap"
@@ -199,10 +195,8 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     Raises:
         SourceError: The source cannot be read, or takes more time or memory than a file of its size should.
     """
-    if is_cloud(uri, options):
-        open_cloud(uri, options)
-    else:
-        _check(lambda: _open_source(uri, options).truth(), uri)
+    if not is_cloud(uri, options):  # else the extension that opens it checks it
+        check_opening(lambda: _open_source(uri, options).truth(), uri)
     return _open_source(uri, options)
 
 
@@ -214,38 +208,13 @@ def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
     if kind is None or not kind.depends_on_contents or (options is not None and options.form != "auto"):
         return _is_cloud(uri, options)
     try:
-        found = _check(lambda: _is_cloud(uri, options), uri)
+        found = check_opening(lambda: _is_cloud(uri, options), uri)
     except SourceError:
         return kind.is_cloud
     return _is_cloud(uri, options) if found is None else found
 
 
-def open_cloud(uri: str, options: SourceOptions | None = None) -> WholeCloud:
-    """Open a whole cloud, see `pipeline.io.readers.clouds.open_cloud`; on Linux first in a child process with
-    limits.
-
-    Raises:
-        SourceError: As for `open_source`.
-    """
-    from pipeline.io.readers.clouds import open_cloud as _open_cloud
-
-    _check(lambda: _open_cloud(uri, options), uri)
-    return _open_cloud(uri, options)
-
-
-def check_cloud(uri: str, options: SourceOptions | None = None) -> None:
-    """Check that a whole cloud can be opened, in a child process with limits of time and memory. Nothing is
-    checked on systems other than Linux, or if the path does not exist.
-
-    Raises:
-        SourceError: The cloud cannot be read, or takes more time or memory than a file of its size should.
-    """
-    from pipeline.io.readers.clouds import open_cloud as _open_cloud
-
-    _check(lambda: _open_cloud(uri, options), uri)
-
-
-def _check(opening: Callable[[], object], uri: str) -> bool | None:
+def check_opening(opening: Callable[[], object], uri: str) -> bool | None:
     """Run an opening with limits, see `run_limited`, if the source is a file or a folder; otherwise do
     nothing. Return its result if it is a bool. Raises SourceError if it fails or exceeds its limits."""
     size = _size(uri)

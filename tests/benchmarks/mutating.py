@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import app.sources  # noqa: F401 - adds the formats of the extensions
+from app.extensions.clouds.point_cloud import open_cloud
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
-from pipeline.io.readers.clouds import open_cloud
 from pipeline.types.records import Scan
 
 PAGE = 1024  # bytes of a page of an E57 file; the last four are its CRC-32C

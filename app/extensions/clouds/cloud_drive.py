@@ -22,13 +22,14 @@ import numpy as np
 
 from app.extensions.clouds.drive_address import parse_drive
 from app.extensions.clouds.plot_ground import ground_steps
+from app.extensions.clouds.records import WholeCloud
+from app.extensions.clouds.sources import open_cloud
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from app.sources.one_step import finish
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.ground_truth import read_truth_trees
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.jit import compiled
 from pipeline.simulation import run as simulated
@@ -46,7 +47,7 @@ from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, random_
 from pipeline.simulation.scenarios import SCHEME, RunRequest
 from pipeline.simulation.scene import SimulatedScene
 from pipeline.simulation.terrain import SimulatedTerrain
-from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees, WholeCloud
+from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees
 
 NEIGHBOURS = 10
 SURFACE, FLAT = 0.35, 0.03  # ratio of smallest to middle eigenvalue of the covariance of the neighbours

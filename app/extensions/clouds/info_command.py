@@ -12,7 +12,7 @@ from app.cli.flags import plain, program, source_request
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.types.records import CloudDescription
+    from app.extensions.clouds.records import CloudDescription
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int | None:
     """Print the description of a whole cloud as lines or, with --json, as JSON, and return 0; None for
     another source. Raises StemmapError if the cloud cannot be read."""
-    from app.sources.opening import is_cloud, open_cloud
+    from app.extensions.clouds.sources import open_cloud
+    from app.sources.opening import is_cloud
 
     options = source_request(arguments, arguments.source).options()
     if not is_cloud(arguments.source, options):

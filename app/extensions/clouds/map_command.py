@@ -28,7 +28,8 @@ def run(arguments: argparse.Namespace) -> int | None:
     """
     name, parameters = flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag at once
 
-    from app.sources.opening import is_cloud, open_cloud
+    from app.extensions.clouds.sources import open_cloud
+    from app.sources.opening import is_cloud
 
     request = flags.source_request(arguments, arguments.source)
     if not is_cloud(arguments.source, request.options()):
@@ -41,11 +42,11 @@ def run(arguments: argparse.Namespace) -> int | None:
         )
     from app.batch.run_folder import check_folder, partial_output_warnings
     from app.cli.map import print_result
+    from app.extensions.clouds.cloud_frame import TOO_COARSE
     from app.extensions.clouds.inventory import NO_TREE, SECTION, SLICE, TWICE, UNIT_DOUBT
     from app.extensions.clouds.result_files import map_plot_run
+    from app.extensions.clouds.up_axis import UP_UNCLEAR
     from pipeline.io.ground_truth import read_truth_trees
-    from pipeline.io.readers.cloud_frame import TOO_COARSE
-    from pipeline.io.readers.up_axis import UP_UNCLEAR
 
     flags.print_warnings(partial_output_warnings(arguments.out))
     truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None

@@ -16,7 +16,7 @@ from app.batch.run_folder import read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_beside
-from pipeline.io.readers.clouds import SYSTEM_OF_DRIVE
+from pipeline.io.readers.las import SYSTEM_OF_DRIVE
 from pipeline.io.result_files import ODOMETRY
 
 if TYPE_CHECKING:

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from app.extensions.clouds.records import WholeCloud
 from app.extensions.clouds.terrain_raster import LowestReturns, NoiseBelow, TerrainRaster, heights_above
 from app.extensions.clouds.thinning import Thinned
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.types.records import Float32, WholeCloud
+from pipeline.types.records import Float32
 
 MOST_RASTER = 128 << 20  # bytes
 SQUARE = 8.0  # m

@@ -23,6 +23,7 @@ from app.batch.summary import FAR_FROM_PLOT, evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
 from app.extensions.clouds.inventory import PlotMap, map_plot
 from app.extensions.clouds.inventory.cross_sections import slice_heights
+from app.extensions.clouds.records import CloudDescription, WholeCloud
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from app.store.forests import kept_forests
 from pipeline.config import Parameters
@@ -38,7 +39,7 @@ from pipeline.io.result_files import (
     seen_text,
 )
 from pipeline.seen_area import covered_area
-from pipeline.types.records import CloudDescription, Trees, TruthTrees, Verdict, WholeCloud
+from pipeline.types.records import Trees, TruthTrees, Verdict
 
 SLICE_COLUMNS = (
     "tree",

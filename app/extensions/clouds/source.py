@@ -14,6 +14,7 @@ from app.explain.records import ClusterStory, TreeStory
 from app.extensions.clouds import stories
 from app.extensions.clouds.frame import frame_of
 from app.extensions.clouds.inventory import PARAMETERS, Inventory, PlotMap
+from app.extensions.clouds.records import WholeCloud
 from app.sources.one_step import OneStep, OneStepSource
 from app.store.forests import kept_forests
 from app.worker.protocol import RunCounts
@@ -21,7 +22,7 @@ from pipeline.config import Parameters
 from pipeline.geometry.poses import Pose3
 from pipeline.io.block_file import LARGE
 from pipeline.io.readers.base import SourceDescription
-from pipeline.types.records import Float, Float32, Frame, Sensor, Verdict, WholeCloud
+from pipeline.types.records import Float, Float32, Frame, Sensor, Verdict
 
 
 class CloudSource(OneStepSource):

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
@@ -131,7 +131,7 @@ def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
         return opener
     if not path.is_file():
         raise SourceError("neither a file nor a folder", where=uri, remedy=readable())
-    head = _head_of(path)
+    head = head_of(path)
     if not head:
         raise SourceError(
             "the file is empty",
@@ -139,7 +139,7 @@ def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
             remedy="Compare it with the original: if that is empty too, nothing was recorded.",
         )
     kind = file_format(path, head)
-    if kind is not None and kind.holds_points and not kind.refusal:
+    if kind is not None and kind.table is not None and not kind.refusal:
         return _cloud if is_cloud(str(path), options) else _scans
     if kind is None:
         promised = expected_format(path)
@@ -155,21 +155,14 @@ def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
 Opener = Callable[[str, Path, SourceOptions], Source]
 
 
-def _opener(module: str, function: str) -> Opener:
-    """Return an opener that imports `module` of this package and calls its `function` when a file is opened,
+def _later(module: str, function: str) -> Callable[..., Any]:
+    """Return a function that imports `module` of this package and calls its `function` when a file is opened,
     so that formats which are not used are not imported."""
-
-    def opened(uri: str, path: Path, options: SourceOptions) -> Source:
-        """Import the module, and return the source that its function opens; errors are those of this
-        function."""
-        found: Opener = getattr(import_module(f"pipeline.io.readers.{module}"), function)
-        return found(uri, path, options)
-
-    return opened
+    return lambda *given: getattr(import_module(f"pipeline.io.readers.{module}"), function)(*given)
 
 
-_recording = _opener("live", "open_recording")
-_scans = _opener("scan_folder", "ScanFolder")
+_recording: Opener = _later("live", "open_recording")
+_scans: Opener = _later("scan_folder", "ScanFolder")
 
 
 def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
@@ -191,9 +184,8 @@ class Format:
         suffixes: Usual suffixes in lower case.
         open: Function of URI, path and options that opens the source.
         is_cloud: Whether it is usually a whole cloud.
-        holds_points: Whether it is a file of points: a whole cloud or one scan.
-        depends_on_contents: Whether its contents decide which of them, see `cloud_or_scan`.
-        table: Opens the table of a file of points (`PointTable`); None for the formats of this package.
+        depends_on_contents: Whether its contents decide that, see `cloud_or_scan`.
+        table: Opens the table of a file of points (`PointTable`): a whole cloud or one scan. None for others.
         accepts: Whether a file with these first bytes is of this format, for a format without magic bytes
             whose suffixes others have, too; None for other formats.
         scheme: Beginning of the addresses that it opens, such as "sim:cloud"; "" for none. Options `file` and
@@ -209,7 +201,6 @@ class Format:
     suffixes: tuple[str, ...]
     open: Opener
     is_cloud: bool = False
-    holds_points: bool = False
     depends_on_contents: bool = False
     table: Callable[[Path], PointTable] | None = None
     accepts: Callable[[bytes], bool] | None = None
@@ -245,14 +236,14 @@ def format_of_points(
     words: str,
     magic: tuple[bytes, ...],
     *suffixes: str,
+    table: Callable[[Path], PointTable],
     is_cloud: bool = True,
     by_contents: bool = True,
-    table: Callable[[Path], PointTable] | None = None,
     accepts: Callable[[bytes], bool] | None = None,
 ) -> Format:
     """Return a format of files of points, see `Format`."""
     opener = _cloud if is_cloud else _scans
-    return Format(words, magic, suffixes, opener, is_cloud, True, by_contents, table, accepts)
+    return Format(words, magic, suffixes, opener, is_cloud, by_contents, table, accepts)
 
 
 FILES = (
@@ -260,12 +251,26 @@ FILES = (
     Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
     format_of_points(
-        ".pcd (whole cloud or scan)", (b"# .PCD", b"VERSION", b"FIELDS"), ".pcd", is_cloud=False
+        ".pcd (whole cloud or scan)",
+        (b"# .PCD", b"VERSION", b"FIELDS"),
+        ".pcd",
+        table=_later("point_files", "open_pcd"),
+        is_cloud=False,
     ),
-    format_of_points("whole cloud .laz or .las", (b"LASF",), ".laz", ".las", by_contents=False),
-    format_of_points("whole cloud .ply", (b"ply\n", b"ply\r"), ".ply"),
-    format_of_points("whole cloud .npy or .npz", (b"\x93NUMPY",), ".npy", ".npz"),
-    format_of_points("KITTI .bin", (), ".bin", is_cloud=False),
+    format_of_points(
+        "whole cloud .laz or .las",
+        (b"LASF",),
+        *(".laz", ".las"),
+        table=_later("las", "open_las"),
+        by_contents=False,
+    ),
+    format_of_points(
+        "whole cloud .ply", (b"ply\n", b"ply\r"), ".ply", table=_later("point_files", "open_ply")
+    ),
+    format_of_points(
+        "whole cloud .npy or .npz", (b"\x93NUMPY",), ".npy", ".npz", table=_later("point_files", "open_numpy")
+    ),
+    format_of_points("KITTI .bin", (), ".bin", table=_later("point_files", "open_rows"), is_cloud=False),
 )
 
 _MOST_NAMED = 5
@@ -319,13 +324,13 @@ def file_format(path: Path, head: bytes) -> Format | None:
     return next((kind for kind in formats() if kind.accepts is not None and kind.accepts(head)), None)
 
 
-HEAD = 64 << 10  # bytes by which a format is found
+_HEAD = 64 << 10  # bytes by which a format is found
 
 
-def _head_of(path: Path) -> bytes:
+def head_of(path: Path) -> bytes:
     """Return the first bytes of a file; OSError if it cannot be read."""
     with path.open("rb") as file:
-        return file.read(HEAD)
+        return file.read(_HEAD)
 
 
 def expected_format(path: Path) -> Format | None:
@@ -339,10 +344,10 @@ def points_format(uri: str) -> Format | None:
     that cannot be read."""
     try:
         path = Path(uri).expanduser()
-        kind = file_format(path, _head_of(path)) or expected_format(path)
+        kind = file_format(path, head_of(path)) or expected_format(path)
     except (OSError, ValueError, RuntimeError):
         return None
-    return kind if kind is not None and kind.holds_points else None
+    return kind if kind is not None and kind.table is not None else None
 
 
 def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
@@ -360,7 +365,7 @@ def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
         return kind is not None and form == "cloud"
     if not kind.depends_on_contents:
         return kind.is_cloud
-    from pipeline.io.readers.clouds import form_of_file
+    from pipeline.io.readers.cloud_or_scan import form_of_file
 
     try:
         return form_of_file(Path(uri).expanduser()).is_cloud
@@ -375,7 +380,7 @@ def is_recording(path: Path) -> bool:
     if expected is None or expected.refusal or expected.accepts is None:
         return expected is not None and not expected.refusal
     try:
-        return expected.accepts(_head_of(path))
+        return expected.accepts(head_of(path))
     except OSError:
         return False
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
 
 import numpy as np
 
 from pipeline.io.readers.base import COORDINATE_LIMIT
-from pipeline.io.readers.cloud_frame import CloudSample
-from pipeline.io.readers.point_files import PointTable
+from pipeline.io.readers.point_files import PART, Columns, PointTable, ScanFileError, open_table
 from pipeline.io.readers.point_times import time_fields
 from pipeline.io.readers.scan_columns import RING
 from pipeline.types.records import Float
@@ -37,6 +39,12 @@ _TALLEST = 110.0
 _SAME_BEAM = 1e-5  # rad; two returns of one beam
 _TESTED = 20_000  # points
 
+_AXES = ("x", "y", "z")
+_LARGEST = 1000.0 * COORDINATE_LIMIT  # of a coordinate in millimetres; larger ones are damaged
+_SAMPLED = 400_000  # points of a sample
+_PLACES = 16  # of the file from which they are taken
+_LEAST_POINTS = 1000  # by which whole numbers are known
+
 
 @dataclass(frozen=True, slots=True)
 class Form:
@@ -62,6 +70,17 @@ def is_decided_by_points(table: PointTable) -> bool:
     """Return whether the points of a table decide: of PCD and KITTI .bin. PLY and NumPy are formats of whole
     clouds, and scans only if their columns say so."""
     return table.kind.startswith(("PCD", "KITTI"))
+
+
+def form_of_file(path: Path) -> Form:
+    """Return whether a PCD, PLY, NumPy or KITTI .bin file is a whole cloud or one scan.
+
+    Raises:
+        ScanFileError: The file is damaged.
+        OSError: The file cannot be read.
+    """
+    table = open_table(path)
+    return form_of(table, sample_of(table) if is_decided_by_points(table) else None)
 
 
 def form_of(table: PointTable, sample: CloudSample | None) -> Form:
@@ -136,3 +155,55 @@ def _directions(points: Float) -> tuple[float, float, float]:
     falling = float(np.cov(reach, angle)[0, 1] / max(float(reach.var()), 1e-12))
     low, high = np.percentile(angle, [10.0, 90.0])
     return float(hidden.mean()), falling, float(high - low)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudSample:
+    """Points from all over a file.
+
+    Attributes:
+        xyz: Points in the unit of the file, finite, shape (N, 3).
+        is_integer: Whether the file stores whole numbers.
+        is_complete: Whether all points were read, of which these are an even share.
+    """
+
+    xyz: Float
+    is_integer: bool
+    is_complete: bool
+
+
+def sample_of(table: PointTable) -> CloudSample:
+    """Return a sample of at most _SAMPLED points: of a small file (_PLACES x PART points) evenly from all
+    points, else from up to _PLACES places of it.
+
+    Raises:
+        ScanFileError: The file is damaged before its first point.
+        OSError: The file cannot be read.
+    """
+    is_complete = table.points <= _PLACES * PART
+    parts = table.parts() if is_complete else _parts_of_places(table)
+    step = max(1, -(-min(table.points, _PLACES * PART) // _SAMPLED))
+    found, whole = [np.zeros((0, 3))], True
+    for part in parts:
+        whole = whole and all(part[axis].dtype.kind in "iu" for axis in _AXES)
+        with np.errstate(over="ignore", invalid="ignore"):
+            xyz = np.stack([part[axis][::step].astype(np.float64) for axis in _AXES], axis=1)
+        with np.errstate(invalid="ignore"):
+            found.append(xyz[(np.abs(xyz) < _LARGEST).all(axis=1)])
+    xyz = np.concatenate(found)
+    if len(xyz) >= _LEAST_POINTS and not whole:  # numbers of a text, or floats that hold whole numbers
+        whole = bool((xyz == np.floor(xyz)).all())
+    return CloudSample(xyz, whole and len(xyz) > 0, is_complete)
+
+
+def _parts_of_places(table: PointTable) -> Iterator[Columns]:
+    """Yield the first part from each of up to _PLACES places of a file; damage at a later place ends it."""
+    starts = table.starts or tuple(table.points * k // _PLACES for k in range(_PLACES))
+    chosen = starts[:: max(1, -(-len(starts) // _PLACES))]
+    for begin in chosen:
+        try:
+            yield from islice(table.parts(begin), 1)
+        except (ScanFileError, OSError):
+            if begin == chosen[0]:
+                raise
+            return

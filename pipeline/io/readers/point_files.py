@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers import expected_format, file_format, head_of, readable
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss
 from pipeline.io.readers.pose_files import read_rows
 from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT
@@ -39,7 +40,6 @@ STEP_LIMIT = 64 << 10  # bytes per point
 #: Largest compressed PCD data, which is held in memory as a whole.
 WHOLE_LIMIT = 1 << 30  # bytes
 MISSING = "points that the files promise but do not hold"
-_HEADER_LIMIT = 64 << 10  # bytes
 _NPY_HEADER_LIMIT = 16 << 10  # bytes; NumPy itself refuses headers of more than 10,000
 _MOST_FIELDS = 1000
 #: What damaged data and zips raise when they are read.
@@ -145,16 +145,24 @@ class PointTable:
                 raise
 
 
-_PLY = (b"ply\n", b"ply\r")
-_PCD = (b"# .PCD", b"VERSION", b"FIELDS")
-_NPY = b"\x93NUMPY"
-_ZIP = (b"PK\x03\x04", b"PK\x05\x06")
+def open_table(path: Path) -> PointTable:
+    """Return the table of a file, whose format is found by its contents, then by its name; only the header is
+    read.
+
+    Raises:
+        ScanFileError: The file has an unknown format, or one that cannot be used, contradicts itself, or has
+            no x, y and z.
+        OSError: The file cannot be read.
+    """
+    kind = file_format(path, head_of(path)) or expected_format(path)
+    if kind is None or kind.table is None:
+        raise ScanFileError("not a file of points", readable())
+    if kind.refusal:
+        raise ScanFileError(f"{kind.words} needs an extension", kind.refusal)
+    return kind.table(path)
 
 
-def is_table(head: bytes) -> bool:
-    """Return whether a file is a PLY, PCD or NumPy file by its first bytes (at least 8)."""
-    return head.startswith((*_PLY, *_PCD, _NPY, *_ZIP))
-
+# --- rows without a header ---------------------------------------------------------------------------
 
 #: Rows of .bin files, of float32 each: KITTI, nuScenes, Boreas. Those of NCLT are whole numbers.
 _ROWS = (
@@ -198,10 +206,8 @@ def open_rows(path: Path) -> PointTable:
 
 def _rows_table(path: Path, kind: str, dtype: np.dtype[Any], size: int) -> PointTable:
     """Return the table of rows without a header in a file of some bytes. An incomplete last row is a promised
-    point, which its reader counts as missing; those of KITTI are counted by `scan_folder.load_bin`."""
-    whole, rest = divmod(size, dtype.itemsize)
-    points = whole + (rest > 0 and kind != _ROWS[0][0])
-    return _binary_table(path, kind, points, [_Stream(0, dtype, size)])
+    point, which its reader counts as missing."""
+    return _binary_table(path, kind, -(-size // dtype.itemsize), [_Stream(0, dtype, size)])
 
 
 def _first_rows(head: bytes, dtype: np.dtype[Any]) -> Columns:
@@ -224,27 +230,6 @@ def _are_rows(columns: Columns) -> bool:
     x, y, z, reflectance = rows[~np.isnan(rows).any(axis=1)].T
     sound = (np.maximum(np.abs(x), np.abs(y)) < RANGE_LIMIT) & (np.abs(z) < _HIGHEST) & (reflectance >= 0.0)
     return bool(sound.size and sound.mean() > _FITTING)
-
-
-def open_table(path: Path) -> PointTable:
-    """Return the table of a file, whose format is found by its contents; only the header is read.
-
-    Raises:
-        ScanFileError: The file has none of these formats, contradicts itself, or has no x, y and z.
-        OSError: The file cannot be read.
-    """
-    with path.open("rb") as file:
-        head = file.read(_HEADER_LIMIT)
-    if head.startswith(_PLY):
-        return _open_ply(path, head)
-    if head.startswith(_PCD):
-        return _open_pcd(path, head)
-    if head.startswith(_NPY):
-        array = _npy_header(io.BytesIO(head), None, path.stat().st_size)
-        return _binary_table(path, "NumPy .npy", array.shape[0], array.streams())
-    if head.startswith(_ZIP):
-        return _open_npz(path)
-    raise ScanFileError("its contents are not those of a PLY, NumPy or PCD file", EXPORT)
 
 
 def read_columns(table: PointTable, losses: dict[str, int]) -> Columns:
@@ -452,15 +437,15 @@ _PCD_TYPES = {("F", 4): "<f4", ("F", 8): "<f8"}
 _PCD_TYPES |= {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
 
 
-def _open_pcd(path: Path, head: bytes) -> PointTable:
-    """Return the table of a PCD file, whose first bytes are `head`.
+def open_pcd(path: Path) -> PointTable:
+    """Return the table of a PCD file.
 
     Raises:
         ScanFileError: The header is damaged, lacks x, y or z, or promises too many points, or packed data of
             more than WHOLE_LIMIT bytes.
         OSError: The file cannot be read.
     """
-    dtype, points, data, start, height, view = _pcd_header(head)
+    dtype, points, data, start, height, view = _pcd_header(head_of(path))
     kind = f"PCD {data}"
     if data == "ascii":
         return replace(_text_table(path, kind, points, dtype, start), view=view, height=height)
@@ -658,21 +643,17 @@ class _PlyElement:
         return sum(np.dtype(count or kind).itemsize for _, kind, count in self.properties)
 
 
-def _open_ply(path: Path, head: bytes) -> PointTable:
+def open_ply(path: Path) -> PointTable:
     """Return the table of the first element "vertex", "point" or "points" of a PLY file. Its points are read
     later; lists are skipped.
-
-    Args:
-        path: The file.
-        head: The first bytes of the file, with the whole header.
 
     Raises:
         ScanFileError: The header is damaged or promises too many points, there is no such element, it has no
             x, y or z, or the file ends before its first point. In a text file, also if a list stands before
             x, y and z.
-        OSError: The size of a binary file cannot be read.
+        OSError: The file cannot be read.
     """
-    order, elements, start = _ply_header(head)
+    order, elements, start = _ply_header(head_of(path))
     place = next((k for k, e in enumerate(elements) if e.name in ("vertex", "point", "points")), None)
     if place is None:
         raise ScanFileError("the PLY file has no vertices", EXPORT)
@@ -928,6 +909,16 @@ class _NumpyArray:
         other, with the name `name`."""
         start = self.start + number * self.shape[0] * self.dtype.itemsize
         return _Stream(start, np.dtype([(name, self.dtype)]), self.room, self.member)
+
+
+def open_numpy(path: Path) -> PointTable:
+    """Return the table of an .npy or .npz file, see `_NumpyArray.streams` and `_open_npz`; errors are those
+    of these."""
+    head = head_of(path)
+    if head.startswith(b"PK"):
+        return _open_npz(path)
+    array = _npy_header(io.BytesIO(head), None, path.stat().st_size)
+    return _binary_table(path, "NumPy .npy", array.shape[0], array.streams())
 
 
 def _open_npz(path: Path) -> PointTable:

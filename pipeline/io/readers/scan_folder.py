@@ -15,12 +15,10 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import folders_of_runs, named, recordings_in
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.cloud_frame import sample_of
-from pipeline.io.readers.cloud_or_scan import form_of
-from pipeline.io.readers.clouds import open_points
+from pipeline.io.readers.cloud_or_scan import form_of, sample_of
 from pipeline.io.readers.firing_order import FIRING_ORDER
 from pipeline.io.readers.mounting import assumed_mounting
-from pipeline.io.readers.point_files import Columns, ScanFileError, open_rows, open_table, read_columns
+from pipeline.io.readers.point_files import Columns, ScanFileError, open_table, read_columns
 from pipeline.io.readers.point_times import PointTimes, decide_point_times
 from pipeline.io.readers.pose_files import TextError, pose_at, read_pose_rows, read_times, seconds_ns, time_ns
 from pipeline.io.readers.scan_columns import (
@@ -53,9 +51,6 @@ _STEP, _STEP_SHARE, _STEP_TURN = 1.0, 0.1, 0.05
 _DECISIVE = 1.0
 
 T = TypeVar("T")
-#: Reads one file: (path, stamp_ns, times, losses) -> scan. Raises ScanFileError or OSError.
-Loader = Callable[[Path, int, PointTimes | None, dict[str, int]], Scan]
-
 #: Pose of each scan, None for a scan without one, and new times of the scans [ns], if any.
 Fit = tuple[list[Pose3 | None], Int | None]
 
@@ -94,13 +89,13 @@ class ScanFolder(FileSource):
         """
         super().__init__()
         self._suffix, self._files = _scan_files(path)
-        self._kind, self._load, sensor_of_first = FORMATS[self._suffix]
+        self._kind = FORMATS[self._suffix]
         self._T_file_lidar: dict[Path, Pose3] = {}
         if not self._files:
             raise SourceError(f"the folder has no {self._suffix} files", where=uri)
         if self._suffix == ".bin":
             with suppress(ScanFileError, OSError):  # the loading of the scan states the reason
-                self._kind = open_rows(self._files[0]).kind
+                self._kind = open_table(self._files[0]).kind
         self._warnings: list[str] = []
         self._texts: list[Path] = []
         numbers = np.array([_number(file) for file in self._files], dtype=np.int64)
@@ -137,7 +132,7 @@ class ScanFolder(FileSource):
         self._description = SourceDescription(
             uri=uri,
             kind=self._kind,
-            sensor=sensor_of_first(first),
+            sensor=_kitti_sensor(first) if self._suffix == ".bin" else sensor_of(first),
             T_base_lidar=self._T_base_lidar,
             has_odometry=self._poses is not None,
             has_imu=False,
@@ -295,7 +290,7 @@ class ScanFolder(FileSource):
         for k in moved[:: max(1, len(moved) // _TRIES)][:_TRIES]:
             pose = poses[k]
             try:
-                columns = self._columns(self._files[k], {})
+                columns = _columns_of(self._files[k], {})
             except (ScanFileError, OSError):
                 continue
             points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
@@ -316,7 +311,7 @@ class ScanFolder(FileSource):
         scans = []
         for file, stamp_ns in zip(self._files[:_TRIES], self._stamp.tolist(), strict=False):
             try:
-                timed = timed_scan(stamp_ns, self._columns(file, {}))
+                timed = timed_scan(stamp_ns, _columns_of(file, {}))
             except (ScanFileError, OSError):
                 continue
             # The order of points that were moved to another frame gives no direction of the sensor.
@@ -328,17 +323,13 @@ class ScanFolder(FileSource):
             self._warnings.append(f"times of points: {times.words}")
         return times
 
-    def _columns(self, file: Path, losses: dict[str, int]) -> Columns:
-        """Return the columns of a file of points, see `read_columns`."""
-        table = open_rows(file) if self._suffix == ".bin" else open_points(file)
-        return read_columns(table, losses)
-
     def _load_scan(self, file: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-        """Return the scan of a file in the frame of the sensor; errors as those of a `Loader`."""
+        """Return the scan of a file in the frame of the sensor, which may have no points; errors and `losses`
+        as of `_columns_of`."""
+        columns = _columns_of(file, losses)
         pose = self._T_file_lidar.get(file)
         if pose is None:
-            return self._load(file, stamp_ns, self._times, losses)
-        columns = self._columns(file, losses)
+            return scan_of(stamp_ns, columns, self._times)
         points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
         nothing = ~(points != 0.0).any(axis=1)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -430,7 +421,7 @@ def _refuse_clouds(files: list[Path], suffix: str, uri: str) -> None:
     if len(files) < 2 or suffix not in (".las", ".laz", ".ply"):
         return
     try:
-        table = open_points(files[0])
+        table = open_table(files[0])
         form = form_of(table, sample_of(table))
     except (ScanFileError, OSError):
         return
@@ -445,7 +436,7 @@ def _refuse_clouds(files: list[Path], suffix: str, uri: str) -> None:
 def _form_words(file: Path) -> list[str]:
     """Return why one file is taken as one scan, if its contents decide that; else []."""
     try:
-        table = open_points(file)
+        table = open_table(file)
         return [form_of(table, sample_of(table)).words] if table.kind.startswith("PCD") else []
     except (ScanFileError, OSError):
         return []
@@ -522,45 +513,22 @@ def _number(file: Path) -> int:
 
 # --- formats ---------------------------------------------------------------------------------------
 
-_KITTI_ROW = 16  # bytes: four little-endian float32, x, y, z [m] and reflectance
 HDL_64 = Sensor("HDL-64", 64, float(np.radians(0.4)), float(np.radians(0.17)), 0.03, 120.0)
 
 
-def load_bin(path: Path, stamp_ns: int, times: PointTimes | None, losses: dict[str, int]) -> Scan:
-    """Read a .bin file (see `open_rows`) as a scan, which may have no points. Invalid returns are left out
-    (`clean_scan`); an incomplete last row is left out and counted in `losses`.
-
-    Args:
-        path: The file.
-        stamp_ns: Time of the scan [ns].
-        times: How the times of points are read; None for scans without times.
-        losses: Dict from reasons to numbers of what is left out; increased in place.
-
-    Raises:
-        ScanFileError: The file is too large, or most of its rows are not positions.
-        OSError: The file cannot be read.
-    """
-    table = open_rows(path)
-    columns = read_columns(table, losses)
-    with np.errstate(invalid="ignore"):
-        sound = np.all([np.abs(columns[axis]) < RANGE_LIMIT for axis in "xyz"], axis=0)
-    if 2 * int(np.count_nonzero(sound)) < len(sound):
-        raise ScanFileError("most of its rows are no positions")
-    if table.kind == "KITTI .bin" and path.stat().st_size % _KITTI_ROW:
-        count_loss(losses, "scan files that end within a point")
-    return scan_of(stamp_ns, columns, times)
-
-
-def load_table(path: Path, stamp_ns: int, times: PointTimes | None, losses: dict[str, int]) -> Scan:
-    """Read a PCD, PLY, NumPy, LAS or LAZ file as a scan at a time [ns], which may have no points. Invalid
-    returns are left out (`clean_scan`); points of the header that the file does not have are counted in
-    `losses`, in place.
-
-    Raises:
-        ScanFileError: The file is damaged, has no x, y and z, or its header has more than POINT_LIMIT points.
-        OSError: The file cannot be read.
-    """
-    return scan_of(stamp_ns, read_columns(open_points(path), losses), times)
+def _columns_of(file: Path, losses: dict[str, int]) -> Columns:
+    """Return the columns of a file of points, see `read_columns`; ScanFileError also if most rows of a .bin
+    file, which has no header, are not positions."""
+    missing = dict[str, int]()
+    columns = read_columns(open_table(file), missing)
+    if file.suffix.lower() == ".bin":
+        with np.errstate(invalid="ignore"):
+            sound = np.all([np.abs(columns[axis]) < RANGE_LIMIT for axis in "xyz"], axis=0)
+        if 2 * int(np.count_nonzero(sound)) < len(sound):
+            raise ScanFileError("most of its rows are no positions")
+    for reason, number in missing.items():
+        count_loss(losses, reason, number)
+    return columns
 
 
 def _kitti_sensor(scan: Scan) -> Sensor:
@@ -574,13 +542,13 @@ def _kitti_sensor(scan: Scan) -> Sensor:
     return sensor_of(scan, HDL_64 if dense and -27.0 < low < -20.0 and 1.0 < high < 6.0 else None)
 
 
-#: Name, function that reads a file, and function that infers the LiDAR from the first scan, by suffix.
-FORMATS: dict[str, tuple[str, Loader, Callable[[Scan], Sensor]]] = {
-    ".bin": (".bin", load_bin, _kitti_sensor),
-    ".pcd": ("PCD", load_table, sensor_of),
-    ".ply": ("PLY", load_table, sensor_of),
-    ".npy": ("NumPy", load_table, sensor_of),
-    ".npz": ("NumPy", load_table, sensor_of),
-    ".las": ("LAS", load_table, sensor_of),
-    ".laz": ("LAS", load_table, sensor_of),
+#: Names of the formats of scans by their suffix.
+FORMATS = {
+    ".bin": ".bin",
+    ".pcd": "PCD",
+    ".ply": "PLY",
+    ".npy": "NumPy",
+    ".npz": "NumPy",
+    ".las": "LAS",
+    ".laz": "LAS",
 }

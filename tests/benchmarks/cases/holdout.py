@@ -17,10 +17,11 @@ from tests.benchmarks.package_forest import DATA, REACH, STREET, training_exampl
 from tests.benchmarks.table import Cell, Table
 
 if TYPE_CHECKING:
+    from app.extensions.clouds.records import CloudDescription, WholeCloud
     from app.extensions.clouds.terrain_raster import TerrainRaster
     from app.extensions.learning.examples import Examples
     from pipeline.classification.forest import Forest
-    from pipeline.types.records import CloudDescription, Float, Float32, WholeCloud
+    from pipeline.types.records import Float, Float32
 
 NAME = "holdout"
 LINE = "Trees in places left out of training, whole clouds, diameters by tape (needs STEMMAP_DATA)"
@@ -210,8 +211,8 @@ class CutCloud:
 
 def _whole_clouds() -> Table:
     from app.extensions.clouds.inventory import map_plot
+    from app.extensions.clouds.point_cloud import open_cloud
     from pipeline.config import preset
-    from pipeline.io.readers.clouds import open_cloud
     from tests.benchmarks.cases.plot import stem_scores
 
     rows = []
@@ -239,9 +240,9 @@ def _low_clouds() -> Table:
     import numpy as np
 
     from app.extensions.clouds.inventory import map_plot
+    from app.extensions.clouds.point_cloud import open_cloud
     from pipeline.config import preset
     from pipeline.evaluation import match
-    from pipeline.io.readers.clouds import open_cloud
 
     rows = list[tuple[Cell, ...]]()
     for name in ("pine_plot", "LPine1", "MLS_Clip"):

@@ -9,6 +9,7 @@ import pytest
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import SourceOptions
+from pipeline.io.readers.point_files import MISSING
 from pipeline.io.readers.pose_files import R_LIDAR_CAMERA, read_any_poses
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
@@ -171,5 +172,5 @@ def test_bad_files_among_good_ones_are_counted(tmp_path: Path, opened: Opened):
     assert source.losses == {
         "scan files that cannot be read": 1,
         "scans without points": 1,
-        "scan files that end within a point": 1,
+        MISSING: 1,
     }

@@ -132,7 +132,13 @@ def test_folders_of_results_are_no_runs(tmp_path: Path):
 
 
 def test_no_file_is_opened_to_find_runs_in_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    texts = readers.format_of_points("text", (), ".txt", accepts=lambda head: head.startswith(b"1 2 3"))
+    texts = readers.format_of_points(
+        "text",
+        (),
+        ".txt",
+        table=lambda _: pytest.fail("opened"),
+        accepts=lambda head: head.startswith(b"1 2 3"),
+    )
     monkeypatch.setattr(readers, "_further", [lambda: [texts]])
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "points.txt").write_text("1 2 3\n4 5 6\n")

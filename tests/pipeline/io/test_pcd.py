@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from app.extensions.clouds.point_cloud import open_cloud
 from pipeline.errors import SourceError
-from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.point_files import ScanFileError, lzf_decompress, open_table, read_columns
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened

@@ -15,8 +15,7 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import open_source
 from pipeline.io.readers.base import COORDINATE_LIMIT
-from pipeline.io.readers.clouds import open_points
-from pipeline.io.readers.point_files import MISSING
+from pipeline.io.readers.point_files import MISSING, open_table
 from pipeline.io.readers.pose_files import TextError, read_any_poses
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
@@ -266,7 +265,7 @@ def test_rows_of_bin_files_are_those_of_the_data_set(layout: str, tmp_path: Path
 def test_a_cut_bin_file_keeps_its_layout(layout: str, tmp_path: Path, opened: Opened):
     path = tmp_path / "000000.bin"
     path.write_bytes(written(layout, points(0))[:-7])
-    assert open_points(path).kind == f"{layout} .bin"
+    assert open_table(path).kind == f"{layout} .bin"
     source = opened(tmp_path)
     (scan,) = [record for record in source.records() if isinstance(record, Scan)]
     np.testing.assert_allclose(scan.points, points(0)[:-1], atol=3e-3)
@@ -279,20 +278,20 @@ def test_rows_of_nan_do_not_tell_the_layout(layout: str, tmp_path: Path):
     rows[::20] = np.nan
     path = tmp_path / "000000.bin"
     path.write_bytes(written(layout, rows))
-    assert open_points(path).kind == f"{layout} .bin"
+    assert open_table(path).kind == f"{layout} .bin"
 
 
 def test_signalling_nan_gives_no_warning(tmp_path: Path):
     path = tmp_path / "000000.bin"
     path.write_bytes(4 * b"\x01\x00\x80\x7f" + written("KITTI", points(0)))
-    assert open_points(path).kind == "KITTI .bin"
+    assert open_table(path).kind == "KITTI .bin"
 
 
 def test_a_few_rows_are_those_of_kitti(tmp_path: Path):
     path = tmp_path / "000000.bin"
-    path.write_bytes(written("NCLT", points(0))[:8])
-    table = open_points(path)
-    assert (table.kind, table.points) == ("KITTI .bin", 0)
+    path.write_bytes(written("NCLT", points(0))[:24])
+    table = open_table(path)
+    assert (table.kind, table.points) == ("KITTI .bin", 2)
 
 
 def of_newer_college(poses: list[Pose3]) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from app.extensions.clouds.cloud_frame import TURNED, UNNAMED
 from app.extensions.clouds.inventory.cross_sections import (
     FIGURES,
     HIGHEST,
@@ -39,6 +40,7 @@ from app.extensions.clouds.inventory.stem_model import (
     is_repeated,
 )
 from app.extensions.clouds.plot_ground import ground_steps
+from app.extensions.clouds.records import CloudDescription, WholeCloud
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from app.extensions.clouds.thinning import Thinned
 from app.sources.one_step import finish
@@ -46,8 +48,7 @@ from pipeline.classification import ForestOf, package_alone
 from pipeline.classification.forest import vote
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float
-from pipeline.io.readers.cloud_frame import TURNED, UNNAMED
-from pipeline.types.records import CloudDescription, Float32, Int, Int32, Trees, Verdict, WholeCloud
+from pipeline.types.records import Float32, Int, Int32, Trees, Verdict
 
 COARSE = 0.04  # m; coarser thinning makes diameters less precise
 NEVER = -1  # an unknown time

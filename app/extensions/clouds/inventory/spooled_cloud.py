@@ -9,7 +9,8 @@ from typing import IO
 
 import numpy as np
 
-from pipeline.types.records import CloudDescription, Float32, WholeCloud
+from app.extensions.clouds.records import CloudDescription, WholeCloud
+from pipeline.types.records import Float32
 
 
 class SpooledCloud:

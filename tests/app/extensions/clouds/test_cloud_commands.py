@@ -11,15 +11,15 @@ import pytest
 
 from app.cli import main
 from app.extension import VARIABLE
+from app.extensions.clouds.point_cloud import open_cloud
 from app.sources.opening import check_source
 from app.sources.request import SourceRequest
 from app.worker.process import open_any_or_one_step
 from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.clouds import open_cloud
 from tests.app.cli.test_commands import stemmap
-from tests.pipeline.plots import PLACES, hill, plot, write_las
+from tests.app.extensions.clouds.plots import PLACES, hill, plot, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)
 
@@ -110,7 +110,7 @@ def test_why_a_cloud_cannot_be_opened_is_said(cloud, monkeypatch, error, says):
     def fails(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("pipeline.io.readers.clouds._open_las", fails)
+    monkeypatch.setattr("pipeline.io.readers.las.open_las", fails)
     with pytest.raises(SourceError, match=says):
         open_cloud(str(cloud))
 

@@ -13,14 +13,14 @@ import pyproj
 import pytest
 
 from app.cli import main
+from app.extensions.clouds.cloud_frame import TOO_COARSE, UNNAMED, metric_crs
 from app.extensions.clouds.inventory import _unit_doubt
+from app.extensions.clouds.point_cloud import open_cloud
+from app.extensions.clouds.records import CloudDescription
+from app.extensions.clouds.up_axis import UP, UP_UNCLEAR
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.cloud_frame import TOO_COARSE, UNNAMED, metric_crs
-from pipeline.io.readers.clouds import open_cloud
-from pipeline.io.readers.up_axis import UP, UP_UNCLEAR
-from pipeline.types.records import CloudDescription
-from tests.pipeline.plots import PLACES, plot, write_las
+from tests.app.extensions.clouds.plots import PLACES, plot, write_las
 
 US_FT, FT = 1200.0 / 3937.0, 0.3048
 #: Colorado North and Central (ftUS), UTM 13N; heights in US survey feet, metres.

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from app.cli import main
+from app.extensions.clouds.point_cloud import open_cloud
 from app.sources.opening import is_cloud as is_cloud_in_child
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import is_cloud, open_source
 from pipeline.io.readers.base import SourceOptions
-from pipeline.io.readers.clouds import open_cloud
 from pipeline.types.records import Scan
-from tests.pipeline.plots import plot
+from tests.app.extensions.clouds.plots import plot
 
 
 def pcd(

@@ -9,7 +9,7 @@ import pytest
 from app.batch.map_frame import MapFrame, write_map_frame
 from app.batch.run_folder import read_run
 from app.extensions.clouds.routes import cloud
-from app.sources.opening import open_cloud
+from app.extensions.clouds.sources import open_cloud
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from tests.app.cli.test_commands import stemmap

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from app.extensions.clouds.cloud_frame import TURNED
 from app.extensions.clouds.inventory import TWICE, _no_tree, _standing_twice, _too_thin, map_plot
 from app.extensions.clouds.plot_ground import ground_steps
+from app.extensions.clouds.point_cloud import open_cloud
 from app.extensions.clouds.terrain_raster import NoiseBelow
+from app.extensions.clouds.up_axis import up_by_ground
 from app.sources.one_step import finish
 from pipeline.config import preset
-from pipeline.io.readers.cloud_frame import TURNED
-from pipeline.io.readers.clouds import open_cloud
-from pipeline.io.readers.up_axis import up_by_ground
 from pipeline.types.records import Verdict
-from tests.pipeline.plots import PLACES, Made, hill, plot
+from tests.app.extensions.clouds.plots import PLACES, Made, hill, plot
 
 FOREST = preset("forest")
 

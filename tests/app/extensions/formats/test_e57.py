@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.extensions.clouds.point_cloud import open_cloud
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud
-from pipeline.io.readers.clouds import open_cloud
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
 

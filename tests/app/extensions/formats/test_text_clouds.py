@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from app.cli import main
+from app.extensions.clouds.point_cloud import open_cloud
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud, open_source, recordings_in
-from pipeline.io.readers.clouds import open_cloud
-from tests.pipeline.plots import plot
+from tests.app.extensions.clouds.plots import plot
 
 POINTS = np.round(np.random.default_rng(3).uniform(-9.0, 9.0, (500, 3)), 3)
 UTM = np.array([470_612.25, 6_810_203.5, 278.0])

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.types.records import CloudDescription
+from app.extensions.clouds.records import CloudDescription
 
 
 @dataclass
 class Made:
-    """A cloud in memory (see `pipeline.types.records.WholeCloud`)."""
+    """A cloud in memory (see `app.extensions.clouds.records.WholeCloud`)."""
 
     points: np.ndarray
     losses: dict[str, int] = field(default_factory=dict)

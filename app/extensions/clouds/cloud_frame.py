@@ -5,16 +5,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 import numpy as np
 
-from pipeline.io.readers.base import COORDINATE_LIMIT
-from pipeline.io.readers.point_files import DEGREES, PART, Columns, PointTable, ScanFileError
-from pipeline.io.readers.up_axis import UP, UP_UNCLEAR, turned_words, up_by_ground
+from app.extensions.clouds.up_axis import UP, UP_UNCLEAR, turned_words, up_by_ground
+from pipeline.io.readers.cloud_or_scan import CloudSample
+from pipeline.io.readers.point_files import DEGREES, PointTable, ScanFileError
 from pipeline.types.records import Float
 
 #: Metres per unit; the survey foot of the United States is 1200/3937 m by its definition.
@@ -22,7 +20,6 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200.0 / 3937
 UNIT_WORDS = {
     "m": "metres", "cm": "centimetres", "mm": "millimetres", "ft": "feet", "us-ft": "US survey feet"
 }  # fmt: skip
-_AXES = ("x", "y", "z")
 #: Largest height of a plot with its relief, and side of one [m]; no tree is higher than 116 m.
 _HIGHEST, _WIDEST = 150.0, 400.0
 #: Lowest height of a plot with stems to breast height [m].
@@ -40,62 +37,7 @@ UNNAMED = "metres, as the file names no unit"
 #: How it is known that another axis than z points up.
 TURNED = "by its ground and stems"
 
-_LARGEST = COORDINATE_LIMIT / UNITS["mm"]  # of a coordinate in any unit; larger ones are damaged
-_SAMPLED = 400_000  # points of a sample
-_PLACES = 16  # of the file from which they are taken
 _LEAST_POINTS = 1000  # by which the steps of the coordinates are known
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CloudSample:
-    """Points from all over a file.
-
-    Attributes:
-        xyz: Points in the unit of the file, finite, shape (N, 3).
-        is_integer: Whether the file stores whole numbers.
-        is_complete: Whether all points were read, of which these are an even share.
-    """
-
-    xyz: Float
-    is_integer: bool
-    is_complete: bool
-
-
-def sample_of(table: PointTable) -> CloudSample:
-    """Return a sample of at most _SAMPLED points: of a small file (_PLACES x PART points) evenly from all
-    points, else from up to _PLACES places of it.
-
-    Raises:
-        ScanFileError: The file is damaged before its first point.
-        OSError: The file cannot be read.
-    """
-    is_complete = table.points <= _PLACES * PART
-    parts = table.parts() if is_complete else _parts_of_places(table)
-    step = max(1, -(-min(table.points, _PLACES * PART) // _SAMPLED))
-    found, whole = [np.zeros((0, 3))], True
-    for part in parts:
-        whole = whole and all(part[axis].dtype.kind in "iu" for axis in _AXES)
-        with np.errstate(over="ignore", invalid="ignore"):
-            xyz = np.stack([part[axis][::step].astype(np.float64) for axis in _AXES], axis=1)
-        with np.errstate(invalid="ignore"):
-            found.append(xyz[(np.abs(xyz) < _LARGEST).all(axis=1)])
-    xyz = np.concatenate(found)
-    if len(xyz) >= _LEAST_POINTS and not whole:  # numbers of a text, or floats that hold whole numbers
-        whole = bool((xyz == np.floor(xyz)).all())
-    return CloudSample(xyz, whole and len(xyz) > 0, is_complete)
-
-
-def _parts_of_places(table: PointTable) -> Iterator[Columns]:
-    """Yield the first part from each of up to _PLACES places of a file; damage at a later place ends it."""
-    starts = table.starts or tuple(table.points * k // _PLACES for k in range(_PLACES))
-    chosen = starts[:: max(1, -(-len(starts) // _PLACES))]
-    for begin in chosen:
-        try:
-            yield from islice(table.parts(begin), 1)
-        except (ScanFileError, OSError):
-            if begin == chosen[0]:
-                raise
-            return
 
 
 @dataclass(frozen=True, slots=True, eq=False)
