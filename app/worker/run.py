@@ -349,13 +349,9 @@ class Run:
         if self._map.parameters.are_all(parameters, NOT_OF_THE_MAP):
             return
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
-        reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
         previous, self._previous = self._previous, None
         if previous is not None and previous.rewind_if_same(parameters):
-            done = previous.before.path_length
-            rest = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
-            no_preview: Generator[None, None, None] = (None for _ in ())  # only the current scan is left
-            self._remapping = Remapping(rest, previous, no_preview)
+            self._remapping = self._whole_remapping(previous, done=previous.before.path_length)
             return
         if previous is not None:
             previous.close()
@@ -365,16 +361,17 @@ class Run:
         tree_rerun = self._map.tree_rerun(mapper)
         if tree_rerun is not None:
             self._remapping = TreeRemapping(tree_rerun, self._map, new_map, preview)
-            return
-        rerun = Rerun(mapper, cache, reread, segment_ahead)
-        self._remapping = Remapping(rerun, new_map, preview)
+        else:
+            self._remapping = self._whole_remapping(new_map, preview)
 
-    def _whole_remapping(self, parameters: Parameters) -> Remapping:
-        """Return a rerun of all scans without preview."""
-        mapper, no_preview = self._make_mapper(parameters), (None for _ in ())
-        reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
-        rerun = Rerun(mapper, cache, reread, segment_ahead)
-        return Remapping(rerun, self._new_map(mapper), no_preview)
+    def _whole_remapping(
+        self, new_map: RunMap, preview: Generator[None, None, None] | None = None, *, done: int = 0
+    ) -> Remapping:
+        """Return a rerun of the scans that a map has not `done` yet, after its preview if there is one."""
+        mapper, no_preview = new_map.mapper, (None for _ in ())
+        reread, cache = None if self._is_live else self._cursor.again, self._caches.of(mapper.parameters)
+        rerun = Rerun(mapper, cache, reread, segment_ahead, done=done)
+        return Remapping(rerun, new_map, preview or no_preview)
 
     def _preview_steps(
         self, parameters: Parameters, mapper: Mapper, on_preview: Callable[[Trees], None]
@@ -446,7 +443,8 @@ class Run:
                 finished = remapping.map_next(self.current)
                 new_map = remapping.finish() if finished else None
         except TreesDifferError:  # the whole run must be mapped again, and its preview is known
-            self._remapping = self._whole_remapping(remapping.rerun.mapper.parameters)
+            new_map = self._new_map(self._make_mapper(remapping.rerun.mapper.parameters))
+            self._remapping = self._whole_remapping(new_map)
             remapping.close()
             return None
         except BaseException:  # also a fault of the mapper, which another try would repeat
