@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from pipeline.io.readers.base import RecordedTopic
 
 
-#: Reason of points of a cloud that are left out.
-FAR_FROM_PLOT = "points far from the plot"
 MOST_SPANS = 200  # written; the rest is counted
 
 

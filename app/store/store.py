@@ -172,9 +172,7 @@ class RunRecords:
                 "changed_ns": now,
                 **_figures(figures),
             }
-            key = connection.execute(insert(_records).values(**values)).inserted_primary_key
-            assert key is not None  # noqa: S101 - one row was inserted
-            record = int(key[0])
+            record = _inserted(connection, insert(_records).values(**values))
             connection.execute(insert(_maps).values(record=record, map=figures.map))
             return record
 

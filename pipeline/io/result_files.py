@@ -261,7 +261,7 @@ ODOMETRY = "odometry.tum"
 
 
 def tum_text(poses: Iterable[tuple[int, Pose3]]) -> str:
-    """Return poses at times [ns] as TUM rows, which `read_tum_poses` reads: t [s], x, y, z [m], qx, qy, qz,
+    """Return poses at times [ns] as TUM rows, which `read_any_poses` reads: t [s], x, y, z [m], qx, qy, qz,
     qw."""
     rows = ["# t_s x_m y_m z_m qx qy qz qw"]
     for stamp_ns, pose in poses:

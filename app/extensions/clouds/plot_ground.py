@@ -16,6 +16,8 @@ from pipeline.types.records import Float32
 
 MOST_RASTER = 128 << 20  # bytes
 SQUARE = 8.0  # m
+#: Reason of points that are left out.
+FAR_FROM_PLOT = "points far from the plot"
 LEAST = 20  # points of a square that belongs to the plot with its neighbours
 MOST_SQUARES = 1 << 20
 

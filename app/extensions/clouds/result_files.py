@@ -19,10 +19,11 @@ import numpy as np
 from app.batch.map_frame import WGS84, reproject
 from app.batch.map_run import MappingResult
 from app.batch.run_folder import NO_PATH, as_written, score_map, truth_in_metres
-from app.batch.summary import FAR_FROM_PLOT, evaluation_lines
+from app.batch.summary import evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
 from app.extensions.clouds.inventory import PlotMap, map_plot
 from app.extensions.clouds.inventory.cross_sections import slice_heights
+from app.extensions.clouds.plot_ground import FAR_FROM_PLOT
 from app.extensions.clouds.records import CloudDescription, WholeCloud
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from app.store.forests import kept_forests

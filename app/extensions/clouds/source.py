@@ -9,11 +9,11 @@ from functools import cached_property
 
 import numpy as np
 
-from app.batch.summary import FAR_FROM_PLOT
 from app.explain.records import ClusterStory, TreeStory
 from app.extensions.clouds import stories
 from app.extensions.clouds.frame import frame_of
 from app.extensions.clouds.inventory import PARAMETERS, Inventory, PlotMap
+from app.extensions.clouds.plot_ground import FAR_FROM_PLOT
 from app.extensions.clouds.records import WholeCloud
 from app.sources.one_step import OneStep, OneStepSource
 from app.store.forests import kept_forests

@@ -23,7 +23,7 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.atomic_files import UNFINISHED
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.pose_files import TextError, parse_table, read_tum_poses
+from pipeline.io.readers.pose_files import TextError, parse_table, read_any_poses
 from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Stems, Trees
 from pipeline.types.records import Path as MapPath
 
@@ -317,7 +317,10 @@ def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
     """
     remedy = "It needs a row `time x y z qx qy qz qw` for each TreeManagerState file."
     try:
-        return read_tum_poses(file)
+        times, poses = read_any_poses(file)
+        if times is None:
+            raise TextError("its rows have no times")
+        return times, poses
     except FileNotFoundError:
         raise SourceError(f"there is no {TRAJECTORY} in the folder", where=uri, remedy=remedy) from None
     except TextError as error:

@@ -7,10 +7,12 @@ east, y north) is the ground truth, in a different frame.
 from __future__ import annotations
 
 import heapq
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import takewhile
 from operator import attrgetter
 from pathlib import Path
 
@@ -27,7 +29,7 @@ from pipeline.io.readers.base import (
     count_loss,
     digest_of,
 )
-from pipeline.io.readers.pose_files import parse_numbers, parse_table
+from pipeline.io.readers.pose_files import parse_table
 from pipeline.io.readers.scan_columns import clean_scan
 from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Truth, TruthPath
 
@@ -283,3 +285,34 @@ def _unpack(path: Path, uri: str) -> dict[str, bytes]:
 def _nanoseconds(seconds: Float) -> Int:
     """Return seconds as nanoseconds, rounded, int64 of the same shape."""
     return np.rint(seconds * 1e9).astype(np.int64)
+
+
+_BLOCK = 4 << 20  # bytes of text that are split into words at once, which takes ten times as much memory
+_GAP = re.compile(rb"\s")
+
+
+def parse_numbers(text: bytes) -> tuple[Float, int]:
+    """Return the numbers between blanks or line ends, up to the first word that is not a number, shape (N,),
+    and the number of words from that one on, which are left out; "nan" and "inf" are numbers."""
+    parts, at, left = [np.zeros(0)], 0, 0
+    while at < len(text):
+        gap = _GAP.search(text, at + _BLOCK)
+        end = len(text) if gap is None else gap.end()
+        words = text[at:end].split()
+        try:
+            numbers = np.array([] if left else words, np.float64)
+        except ValueError:
+            numbers = np.array(list(takewhile(_is_number, words)), np.float64)
+        parts.append(numbers)
+        left += len(words) - len(numbers)
+        at = end
+    return np.concatenate(parts), left
+
+
+def _is_number(word: bytes) -> bool:
+    """Return whether a word is a number."""
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

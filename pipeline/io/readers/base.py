@@ -125,8 +125,8 @@ class SourceOptions:
         seed: Random seed of simulated runs.
         as_live: Of the recording of a live run: read only the messages that the live run mapped.
         form: Whether a file of points is a whole "cloud" or one "scan"; "auto" decides by its contents.
-        unit: Unit of the coordinates of a whole cloud, a key of `cloud_frame.UNITS`; "auto" finds it.
-        up: Axis of a whole cloud that points up, a key of `up_axis.UP`; "auto" finds it.
+        unit: Unit of the coordinates of a whole cloud: "m", "cm", "mm", "ft" or "us-ft"; "auto" finds it.
+        up: Axis of a whole cloud that points up, such as "z" or "-y"; "auto" finds it.
     """
 
     topics: dict[str, str] = field(default_factory=dict)

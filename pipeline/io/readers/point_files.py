@@ -103,7 +103,7 @@ class PointTable:
         invalid: What is counted for a point whose coordinates are not finite or too large.
         has_voids: Whether a point with NaN is stated by the file to be none, which is not counted.
         starts: Points from which `read` can begin without reading those before; () for any.
-        units: Units of x and y, and of z, by the file itself, as in `cloud_frame.UNITS`; "" if it names none.
+        units: Units of x and y, and of z, by the file itself, as in `SourceOptions`; "" if it names none.
         exact: Whether `points` is a number that the file promises, and no estimate.
         view: Pose of the sensor by the file (PCD); None if it names none or the identity.
         height: Rows of an organised cloud; 1 for others.

@@ -7,7 +7,7 @@ import re
 import warnings
 from collections.abc import Iterable, Iterator
 from datetime import datetime
-from itertools import islice, takewhile
+from itertools import islice
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -131,15 +131,6 @@ def _poses_of_matrices(rows: Float, T_camera_lidar: Pose3 | None) -> list[Pose3]
         return poses
     T_lidar_camera = T_camera_lidar.inverse()
     return [T_lidar_camera @ pose @ T_camera_lidar for pose in poses]
-
-
-def read_tum_poses(path: Path) -> tuple[Int, list[Pose3]]:
-    """Return times [ns], int64, shape (N,), N >= 1, and poses of a file whose rows have times; errors as
-    `read_any_poses`, also if they have none."""
-    times, poses = read_any_poses(path)
-    if times is None:
-        raise TextError("its rows have no times")
-    return times, poses
 
 
 #: Columns of the time and of the pose (x y z qx qy qz qw or a matrix) by the number of columns; two columns
@@ -444,29 +435,8 @@ def between(first: Pose3, second: Pose3, fraction: float) -> Pose3:
     return Pose3.from_quaternion((1.0 - fraction) * first.t + fraction * second.t, mixed)
 
 
-_BLOCK = 4 << 20  # bytes of text that are split into words at once, which takes ten times as much memory
-_GAP = re.compile(rb"\s")
 _LINES = 1 << 18  # read at once
 _LINE_LIMIT = 1 << 16  # bytes; a longer line is cut, and its parts are damaged lines
-
-
-def parse_numbers(text: bytes) -> tuple[Float, int]:
-    """Return the numbers between blanks or line ends, up to the first word that is not a number, shape (N,),
-    and the number of words from that one on, which are left out; "nan" and "inf" are numbers."""
-    parts, at, left = [np.zeros(0)], 0, 0
-    while at < len(text):
-        gap = _GAP.search(text, at + _BLOCK)
-        end = len(text) if gap is None else gap.end()
-        words = text[at:end].split()
-        try:
-            numbers = np.array([] if left else words, np.float64)
-        except ValueError:
-            whole = takewhile(lambda numbers: numbers is not None, (_numbers([word]) for word in words))
-            numbers = np.array(list(whole), np.float64).ravel()
-        parts.append(numbers)
-        left += len(words) - len(numbers)
-        at = end
-    return np.concatenate(parts), left
 
 
 def parse_table(text: bytes, columns: int, *, more: bool = False) -> tuple[Float, int]:

@@ -60,30 +60,13 @@ class LayoutError(Exception):
     """The header of a cloud or laser scan contradicts itself or its data."""
 
 
-def decode_cloud(
-    cloud: ros2.sensor_msgs__msg__PointCloud2,
-    stamp_ns: int,
-    times: PointTimes | None = None,
-    header_ns: int | None = None,
-) -> Scan:
-    """Decode a PointCloud2 message of any layout. Points that are not valid returns are left out, see
-    `clean_scan`.
-
-    Args:
-        cloud: The message.
-        stamp_ns: Time of the scan [ns].
-        times: How times of points are read; None for scans without times.
-        header_ns: Stamp in the header [ns], if it differs from `stamp_ns`.
+def columns_of_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2) -> dict[str, NDArray[np.generic]]:
+    """Return a dict from names to the columns of a PointCloud2 of any layout that are read, shape (N,).
 
     Raises:
         LayoutError: Width, height, steps, fields and length of the data do not fit together, x, y or z is
             missing or not a floating number, or there are more than POINT_LIMIT points.
     """
-    return scan_of(stamp_ns, _columns(cloud), times, header_ns)
-
-
-def _columns(cloud: ros2.sensor_msgs__msg__PointCloud2) -> dict[str, NDArray[np.generic]]:
-    """Return a dict from names to columns of a cloud, shape (N,). LayoutError as in `decode_cloud`."""
     table = _table(cloud)
     return {name: table[name] for name in table.dtype.names or ()}
 
@@ -326,7 +309,7 @@ class RecordDecoder:
         channel = self._channels[message.channel]
         if channel.msgtype == POINT_CLOUD:
             cloud: ros2.sensor_msgs__msg__PointCloud2 = self.message(message)
-            return frame_name(cloud.header.frame_id), _columns(cloud)
+            return frame_name(cloud.header.frame_id), columns_of_cloud(cloud)
         custom = decode_custom(message.payload, channel.encoding)
         return frame_name(custom.frame), _columns_of_custom(custom, self._header_ns(message))
 

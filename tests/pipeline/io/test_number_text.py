@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.io.readers.pose_files import parse_numbers, parse_table, read_rows
+from pipeline.io.readers.pose_files import parse_table, read_rows
 
 
 @given(
@@ -53,23 +53,3 @@ def test_a_line_without_end_is_read_in_bounded_parts() -> None:
     text = b"1 2\n" + b"9" * 10_000_000 + b"\n3 4\n"
     rows = np.concatenate(list(read_rows(io.BytesIO(text), 2, 1_000)))
     np.testing.assert_array_equal(rows, [[1.0, 2.0], [3.0, 4.0]])
-
-
-@pytest.mark.parametrize("word", ["x", "1.2.3", "-", "4e", "."])
-def test_a_sequence_ends_at_the_first_word_that_is_not_a_number(word: str) -> None:
-    numbers, left = parse_numbers(f"1 2\t{word} 3".encode())
-    np.testing.assert_array_equal(numbers, [1.0, 2.0])
-    assert left == 2
-
-
-def test_a_long_sequence_is_split_between_words() -> None:
-    expected = np.random.default_rng(1).uniform(-1e3, 1e3, 600_000)
-    text = b"\t".join(b"%.9f" % number for number in expected)
-    assert len(text) > 8 << 20
-    numbers, left = parse_numbers(text)
-    np.testing.assert_array_equal(numbers, [float(word) for word in text.split()])
-    assert left == 0
-    numbers, left = parse_numbers(b"1 x " + text)
-    np.testing.assert_array_equal(numbers, [1.0])
-    assert left == 1 + len(expected)
-    assert len(parse_numbers(b"  \n")[0]) == 0

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.extensions.formats.victoria_park import Car, dead_reckoning
+from app.extensions.formats.victoria_park import Car, dead_reckoning, parse_numbers
 from pipeline.errors import SourceError
 from pipeline.types.records import Float, Odometry, Scan
 from tests.pipeline.io.conftest import Opened
@@ -172,3 +172,23 @@ def test_a_zip_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, opened: Ope
         archive.writestr("DRS.txt", "0 0 0")
     with pytest.raises(SourceError, match="unpacks to more than 64 MB"):
         opened(path)
+
+
+@pytest.mark.parametrize("word", ["x", "1.2.3", "-", "4e", "."])
+def test_a_sequence_ends_at_the_first_word_that_is_not_a_number(word: str) -> None:
+    numbers, left = parse_numbers(f"1 2\t{word} 3".encode())
+    np.testing.assert_array_equal(numbers, [1.0, 2.0])
+    assert left == 2
+
+
+def test_a_long_sequence_is_split_between_words() -> None:
+    expected = np.random.default_rng(1).uniform(-1e3, 1e3, 600_000)
+    text = b"\t".join(b"%.9f" % number for number in expected)
+    assert len(text) > 8 << 20
+    numbers, left = parse_numbers(text)
+    np.testing.assert_array_equal(numbers, [float(word) for word in text.split()])
+    assert left == 0
+    numbers, left = parse_numbers(b"1 x " + text)
+    np.testing.assert_array_equal(numbers, [1.0])
+    assert left == 1 + len(expected)
+    assert len(parse_numbers(b"  \n")[0]) == 0
