@@ -32,10 +32,10 @@ from pipeline.io.readers.topics import IMAGE, NAV_SAT_FIX, POINT_CLOUD
 from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.types.records import Sensor
 from tests.app.batch.finished_runs import grid_run
-from tests.app.extensions.clouds.plots import write_las
 from tests.app.fakes import FakeSource, FakeWorker, make_mapper
 from tests.app.robot.conftest import clouds
 from tests.app.server_for_tests import BEARER, Running, running
+from tests.pipeline.plots import write_las
 
 MOUNT = (0.1, 0.2, 0.9, 5.0, -3.0, 90.0)
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.app.extensions.clouds.plots import write_las
 from tests.app.extensions.clouds.test_crowns import flat, tree
 from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
+from tests.pipeline.plots import write_las
 
 PLACES = ((2.5, 2.5, 10.0), (7.5, 2.5, 12.0), (2.5, 7.5, 9.0), (7.5, 7.5, 11.0))  # x, y, height [m]
 UTM = (470600.0, 3810200.0, 300.0)

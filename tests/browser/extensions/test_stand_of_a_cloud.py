@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, expect
 
-from tests.app.extensions.clouds.plots import ground, stem, write_las
 from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
+from tests.pipeline.plots import ground, stem, write_las
 
 PLACES = ((2.5, 2.5), (7.5, 2.5), (2.5, 7.5), (7.5, 7.5))  # x, y [m]
 UTM = (470600.0, 3810200.0, 300.0)

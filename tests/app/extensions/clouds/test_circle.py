@@ -8,7 +8,8 @@ import pytest
 from app.extensions.clouds.inventory import map_plot
 from app.extensions.clouds.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from pipeline.config import preset
-from tests.app.extensions.clouds.plots import Made, ground, stem
+from tests.app.extensions.clouds.made import Made
+from tests.pipeline.plots import ground, stem
 
 
 def fitted(xy):

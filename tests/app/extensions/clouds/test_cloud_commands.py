@@ -19,7 +19,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.base import SourceOptions
 from tests.app.cli.test_commands import stemmap
-from tests.app.extensions.clouds.plots import PLACES, hill, plot, write_las
+from tests.pipeline.plots import PLACES, hill, plot, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)
 

@@ -17,7 +17,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.simulation.lidar import SpinningLidar
-from tests.app.extensions.clouds.plots import PLACES, plot, stem, write_las
+from tests.pipeline.plots import PLACES, plot, stem, write_las
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> SimulatedSource:

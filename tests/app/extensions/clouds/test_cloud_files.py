@@ -21,7 +21,7 @@ from app.extensions.clouds.point_cloud import offset_for, open_cloud
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud, open_source
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
-from tests.app.extensions.clouds.plots import plot, write_las
+from tests.pipeline.plots import plot, write_las
 
 UTM = np.array([470600.0, 3810200.0, 2278.0])
 TEXT = (

@@ -20,7 +20,7 @@ from app.extensions.clouds.records import CloudDescription
 from app.extensions.clouds.up_axis import UP, UP_UNCLEAR
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceOptions
-from tests.app.extensions.clouds.plots import PLACES, plot, write_las
+from tests.pipeline.plots import PLACES, plot, write_las
 
 US_FT, FT = 1200.0 / 3937.0, 0.3048
 #: Colorado North and Central (ftUS), UTM 13N; heights in US survey feet, metres.

@@ -15,7 +15,7 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import is_cloud, open_source
 from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import Scan
-from tests.app.extensions.clouds.plots import plot
+from tests.pipeline.plots import plot
 
 
 def pcd(

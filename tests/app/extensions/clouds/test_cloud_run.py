@@ -23,9 +23,9 @@ from pipeline.config import preset
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import Frame, Verdict
-from tests.app.extensions.clouds.plots import PLACES, plot, write_las
 from tests.app.scene.feet import bases, on_terrain, path_of, within
 from tests.app.scene.recorder import Recorder
+from tests.pipeline.plots import PLACES, plot, write_las
 
 FOREST = preset("forest")
 UTM = (470600.0, 3810200.0, 300.0)

@@ -8,7 +8,7 @@ from app.extensions.clouds.inventory.cross_sections import find_columns, stronge
 from app.extensions.clouds.inventory.stem_model import STEM, is_repeated
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.types.records import Verdict
-from tests.app.extensions.clouds.plots import stem
+from tests.pipeline.plots import stem
 
 
 def test_a_column_is_found_in_a_cloud_of_more_than_a_million_voxels():

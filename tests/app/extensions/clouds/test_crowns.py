@@ -11,7 +11,8 @@ from app.extensions.clouds.inventory import Inventory, map_plot
 from app.extensions.clouds.inventory.spooled_cloud import SpooledCloud
 from app.sources.one_step import finish
 from pipeline.config import preset
-from tests.app.extensions.clouds.plots import Made, ground, stem
+from tests.app.extensions.clouds.made import Made
+from tests.pipeline.plots import ground, stem
 
 FOREST = preset("forest")
 TOP = 12.0  # m

@@ -17,7 +17,7 @@ from app.extensions.clouds.point_cloud import open_cloud
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud
 from pipeline.io.readers.point_files import MISSING
-from tests.app.extensions.clouds.plots import PLACES, plot, write_las
+from tests.pipeline.plots import PLACES, plot, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)
 DATA = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "../shared/data"))

@@ -10,7 +10,8 @@ from app.extensions.clouds.inventory.cross_sections import upper_end
 from app.extensions.clouds.terrain_raster import TerrainRaster
 from pipeline.config import preset
 from pipeline.types.records import Verdict
-from tests.app.extensions.clouds.plots import PLACES, Made, bush, ground, hill, plot, stem
+from tests.app.extensions.clouds.made import Made
+from tests.pipeline.plots import PLACES, bush, ground, hill, plot, stem
 
 FOREST = preset("forest")
 

@@ -9,7 +9,8 @@ from app.extensions.clouds.inventory import map_plot
 from pipeline.config import preset
 from pipeline.errors import SourceError
 from pipeline.types.records import Verdict
-from tests.app.extensions.clouds.plots import PLACES, Made, bush, ground, hill, plot, stem
+from tests.app.extensions.clouds.made import Made
+from tests.pipeline.plots import PLACES, bush, ground, hill, plot, stem
 
 FOREST = preset("forest")
 

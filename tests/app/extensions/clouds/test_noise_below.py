@@ -14,7 +14,8 @@ from app.extensions.clouds.up_axis import up_by_ground
 from app.sources.one_step import finish
 from pipeline.config import preset
 from pipeline.types.records import Verdict
-from tests.app.extensions.clouds.plots import PLACES, Made, hill, plot
+from tests.app.extensions.clouds.made import Made
+from tests.pipeline.plots import PLACES, hill, plot
 
 FOREST = preset("forest")
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.extensions.clouds.point_cloud import open_cloud
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud
+from tests.app.extensions.formats.conftest import open_cloud
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
 
@@ -35,8 +35,8 @@ def test_all_stations_stand_in_the_frame_of_the_file(tmp_path: Path):
     wanted = write(tmp_path / "plot.e57")
     cloud = open_cloud(str(tmp_path / "plot.e57"))
     assert is_cloud(str(tmp_path / "plot.e57"))
-    assert (cloud.description.points, cloud.description.kind) == (600, "E57, 2 stations")
-    found = np.concatenate(list(cloud.parts())) + cloud.description.offset
+    assert (cloud.about.points, cloud.description.kind) == (600, "whole cloud, E57, 2 stations")
+    found = np.concatenate(list(cloud.points()))
     np.testing.assert_allclose(found, wanted, atol=2e-3)
     assert cloud.losses == {}
 
@@ -47,7 +47,7 @@ def test_a_cut_file_is_one_clear_error(keep: float, tmp_path: Path):
     whole = (tmp_path / "plot.e57").read_bytes()
     (tmp_path / "plot.e57").write_bytes(whole[: int(keep * len(whole))])
     with pytest.raises(SourceError, match="E57"):
-        list(open_cloud(str(tmp_path / "plot.e57")).parts())
+        list(open_cloud(str(tmp_path / "plot.e57")).points())
 
 
 def test_a_damaged_page_is_one_clear_error_or_a_counted_loss(tmp_path: Path):
@@ -60,6 +60,6 @@ def test_a_damaged_page_is_one_clear_error_or_a_counted_loss(tmp_path: Path):
     middle = len(whole) // 2
     path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
     cloud = open_cloud(str(path))
-    read = sum(len(part) for part in cloud.parts())
+    read = sum(len(part) for part in cloud.points())
     assert 0 < read < 900
     assert cloud.losses == {"points that the files promise but do not hold": 900 - read}

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from app.cli import main
-from app.extensions.clouds.point_cloud import open_cloud
 from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud, open_source, recordings_in
-from tests.app.extensions.clouds.plots import plot
+from pipeline.io.readers.point_files import ScanFileError, open_table
+from tests.app.extensions.formats.conftest import open_cloud
+from tests.pipeline.plots import plot
 
 POINTS = np.round(np.random.default_rng(3).uniform(-9.0, 9.0, (500, 3)), 3)
 UTM = np.array([470_612.25, 6_810_203.5, 278.0])
@@ -63,10 +64,10 @@ def test_separator_header_and_columns_are_recognised(tmp_path: Path, name, head,
     (tmp_path / name).write_bytes(content)
     assert is_cloud(str(tmp_path / name))
     cloud = open_cloud(str(tmp_path / name))
-    assert cloud.description.kind == "text"
-    assert cloud.description.points == 500
+    assert cloud.description.kind == "whole cloud, text"
+    assert cloud.about.points == 500
     for _ in range(2):
-        np.testing.assert_allclose(np.concatenate(list(cloud.parts())), POINTS, atol=1e-5)
+        np.testing.assert_allclose(np.concatenate(list(cloud.points())), POINTS, atol=1e-5)
     assert cloud.losses == {}
 
 
@@ -76,22 +77,22 @@ def test_a_first_column_that_counts_the_rows_is_no_coordinate(tmp_path: Path, fi
     text = "".join(f"{first + k} {row}\n" for k, row in enumerate(rows))
     (tmp_path / "c.txt").write_text(text)
     cloud = open_cloud(str(tmp_path / "c.txt"))
-    np.testing.assert_allclose(np.concatenate(list(cloud.parts())), POINTS, atol=1e-5)
+    np.testing.assert_allclose(np.concatenate(list(cloud.points())), POINTS, atol=1e-5)
 
 
 @pytest.mark.parametrize("form", ["{x};{y};{z}", "{x}\t{y}\t{z}", "{x} {y} {z} 3"])
 def test_a_decimal_comma(tmp_path: Path, form):
     (tmp_path / "c.csv").write_text("X;Y;Z\n".replace(";", form[3]) + lines(POINTS, form, comma=True))
     cloud = open_cloud(str(tmp_path / "c.csv"))
-    np.testing.assert_allclose(np.concatenate(list(cloud.parts())), POINTS, atol=1e-5)
+    np.testing.assert_allclose(np.concatenate(list(cloud.points())), POINTS, atol=1e-5)
 
 
 def test_national_coordinates_keep_their_millimetres(tmp_path: Path):
     (tmp_path / "c.xyz").write_text(lines(POINTS + UTM, "{x} {y} {z}"))
     cloud = open_cloud(str(tmp_path / "c.xyz"))
-    found = np.concatenate(list(cloud.parts())) + cloud.description.offset
+    found = np.concatenate(list(cloud.points()))
     np.testing.assert_allclose(found, POINTS + UTM, atol=1e-3)
-    assert cloud.description.up.startswith("z")
+    assert cloud.about.up.startswith("z")
 
 
 def test_bad_lines_are_counted_and_comments_are_not(tmp_path: Path):
@@ -99,14 +100,14 @@ def test_bad_lines_are_counted_and_comments_are_not(tmp_path: Path):
     rows[7], rows[100], rows[300], rows[301] = "1.0 2.0", "a b c", "", "# a remark"
     (tmp_path / "c.xyz").write_text("\n".join(rows))
     cloud = open_cloud(str(tmp_path / "c.xyz"))
-    assert len(np.concatenate(list(cloud.parts()))) == 496
+    assert len(np.concatenate(list(cloud.points()))) == 496
     assert cloud.losses == {"lines that are no points": 2}
 
 
 def test_a_cut_pts_file_tells_how_many_points_are_missing(tmp_path: Path):
     (tmp_path / "c.pts").write_text("800\n" + lines(POINTS, "{x} {y} {z} 5"))
     cloud = open_cloud(str(tmp_path / "c.pts"))
-    assert len(np.concatenate(list(cloud.parts()))) == 500
+    assert len(np.concatenate(list(cloud.points()))) == 500
     assert cloud.losses == {"points that the files promise but do not hold": 300}
 
 
@@ -114,14 +115,14 @@ def test_pts_of_several_stations(tmp_path: Path):
     half = [lines(part, "{x} {y} {z} 5") for part in (POINTS[:250], POINTS[250:])]
     (tmp_path / "c.pts").write_text("".join(f"250\n{text}" for text in half))
     cloud = open_cloud(str(tmp_path / "c.pts"))
-    np.testing.assert_allclose(np.concatenate(list(cloud.parts())), POINTS, atol=1e-5)
+    np.testing.assert_allclose(np.concatenate(list(cloud.points())), POINTS, atol=1e-5)
     assert cloud.losses == {}
 
 
 def test_the_unit_in_the_names_of_the_columns(tmp_path: Path):
     (tmp_path / "c.csv").write_text("X [mm],Y [mm],Z [mm]\n" + lines(1000.0 * POINTS, "{x},{y},{z}"))
     cloud = open_cloud(str(tmp_path / "c.csv"))
-    np.testing.assert_allclose(np.concatenate(list(cloud.parts())), POINTS, atol=1e-5)
+    np.testing.assert_allclose(np.concatenate(list(cloud.points())), POINTS, atol=1e-5)
     assert any("millimetres" in warning for warning in cloud.description.warnings)
 
 
@@ -188,16 +189,16 @@ def test_stations_of_a_ptx_file_are_read_in_one_frame(tmp_path: Path, stations: 
         "".join(ptx(part, [5.0 + k, 6.0, 1.6], 0.7 * k) for k, part in enumerate(parts)), newline=end
     )
     cloud = open_cloud(str(path))
-    np.testing.assert_allclose(np.concatenate(list(cloud.parts())), POINTS[:400], atol=2e-6)
+    np.testing.assert_allclose(np.concatenate(list(cloud.points())), POINTS[:400], atol=2e-6)
     assert cloud.losses == {}
-    assert cloud.description.kind.startswith(f"PTX, {stations} station")
+    assert cloud.description.kind.startswith(f"whole cloud, PTX, {stations} station")
 
 
 def test_a_cut_ptx_file_is_read_up_to_its_end(tmp_path: Path):
     path = tmp_path / "plot.ptx"
     path.write_text("\n".join(ptx(POINTS[:400], [0.0, 0.0, 1.6], 0.0).splitlines()[:310]) + "\n")
     cloud = open_cloud(str(path))
-    assert sum(map(len, cloud.parts())) == 200
+    assert sum(map(len, cloud.points())) == 200
     assert cloud.losses == {"points that the files promise but do not hold": 200}
 
 
@@ -212,7 +213,7 @@ def test_a_ptx_file_is_refused_if_its_stations_would_lie_on_one_another(tmp_path
 def test_times_before_the_coordinates_are_no_coordinates(tmp_path: Path):
     path = tmp_path / "plot.txt"
     path.write_text(lines(POINTS, "1654001234.123456 {x} {y} {z} 20"))
-    np.testing.assert_allclose(np.concatenate(list(open_cloud(str(path)).parts())), POINTS, atol=1e-5)
+    np.testing.assert_allclose(np.concatenate(list(open_cloud(str(path)).points())), POINTS, atol=1e-5)
 
 
 def test_utf_16_says_what_to_do(tmp_path: Path):
@@ -229,8 +230,8 @@ def test_damaged_texts_never_crash(tmp_path: Path):
         for at in rng.integers(0, min(len(content), 60 if k % 2 else len(content)), 6):
             content[at] = int(rng.integers(0, 256))
         (tmp_path / "c.csv").write_bytes(bytes(content))
-        with suppress(SourceError):
-            assert sum(len(part) for part in open_cloud(str(tmp_path / "c.csv")).parts()) <= 520
+        with suppress(ScanFileError):
+            assert sum(len(part["x"]) for part in open_table(tmp_path / "c.csv").parts()) <= 520
 
 
 def test_a_line_without_end_takes_no_memory(tmp_path: Path):
@@ -238,7 +239,7 @@ def test_a_line_without_end_takes_no_memory(tmp_path: Path):
         file.write(lines(POINTS, "{x} {y} {z}").encode())
         file.write(b"1" * (40 << 20))
     cloud = open_cloud(str(tmp_path / "c.xyz"))
-    assert sum(len(part) for part in cloud.parts()) == 500
+    assert sum(len(part) for part in cloud.points()) == 500
 
 
 def test_a_text_is_mapped_told_of_and_driven_through(tmp_path: Path, capsys):
