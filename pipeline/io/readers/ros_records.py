@@ -60,7 +60,7 @@ class LayoutError(Exception):
     """The header of a cloud or laser scan contradicts itself or its data."""
 
 
-def columns_of_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2) -> dict[str, NDArray[np.generic]]:
+def cloud_columns(cloud: ros2.sensor_msgs__msg__PointCloud2) -> dict[str, NDArray[np.generic]]:
     """Return a dict from names to the columns of a PointCloud2 of any layout that are read, shape (N,).
 
     Raises:
@@ -309,7 +309,7 @@ class RecordDecoder:
         channel = self._channels[message.channel]
         if channel.msgtype == POINT_CLOUD:
             cloud: ros2.sensor_msgs__msg__PointCloud2 = self.message(message)
-            return frame_name(cloud.header.frame_id), columns_of_cloud(cloud)
+            return frame_name(cloud.header.frame_id), cloud_columns(cloud)
         custom = decode_custom(message.payload, channel.encoding)
         return frame_name(custom.frame), _columns_of_custom(custom, self._header_ns(message))
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.io.readers.point_times import PointTimes, TimedScan, decide_point_times
-from pipeline.io.readers.ros_records import columns_of_cloud
+from pipeline.io.readers.ros_records import cloud_columns
 from pipeline.io.readers.scan_columns import scan_of
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
@@ -150,7 +150,7 @@ def test_beams_without_a_return_do_not_count():
         table[axis][seen] = 3.0
     table["timestamp"][seen] = (START_NS + SWEEP[seen]) * 1e-9
     times = PointTimes("timestamp", 10**9, "clock", PERIOD_NS)
-    offset_ns = scan_of(START_NS, columns_of_cloud(encode(table)), times).offset_ns
+    offset_ns = scan_of(START_NS, cloud_columns(encode(table)), times).offset_ns
     assert offset_ns is not None
     np.testing.assert_allclose(offset_ns, SWEEP[seen], atol=500)
 

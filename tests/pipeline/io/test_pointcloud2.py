@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pipeline.io.readers.point_times import PointTimes
-from pipeline.io.readers.ros_records import LayoutError, columns_of_cloud
+from pipeline.io.readers.ros_records import LayoutError, cloud_columns
 from pipeline.io.readers.scan_columns import scan_of
 
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -91,7 +91,7 @@ def test_any_layout_gives_back_what_was_put_in(
     gone = rng.random(len(table)) < 0.3
     table["y"][gone] = np.nan
     times = PointTimes("t", 1, "stamp", 10**8)
-    scan = scan_of(STAMP_NS, columns_of_cloud(encode(table, height=height, padding=padding)), times)
+    scan = scan_of(STAMP_NS, cloud_columns(encode(table, height=height, padding=padding)), times)
     kept = table[~gone]
     assert scan.dropped == np.count_nonzero(gone)
     np.testing.assert_array_equal(scan.points, np.stack([kept[a].astype(np.float32) for a in "xyz"], axis=1))
@@ -124,11 +124,11 @@ XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 )
 def test_headers_that_contradict_the_data_are_refused(changes: dict[str, object]):
     message = encode(np.ones(10, XYZ))
-    assert len(columns_of_cloud(message)["x"]) == 10
+    assert len(cloud_columns(message)["x"]) == 10
     for name, value in changes.items():
         setattr(message, name, value)
     with pytest.raises(LayoutError):
-        columns_of_cloud(message)
+        cloud_columns(message)
 
 
 def test_a_reflectance_that_is_not_finite_is_replaced_in_the_scan_alone():
@@ -136,6 +136,6 @@ def test_a_reflectance_that_is_not_finite_is_replaced_in_the_scan_alone():
     table["intensity"] = np.nan
     message = encode(table)
     message.data.setflags(write=False)
-    reflectance = scan_of(STAMP_NS, columns_of_cloud(message)).reflectance
+    reflectance = scan_of(STAMP_NS, cloud_columns(message)).reflectance
     assert reflectance is not None
     np.testing.assert_array_equal(reflectance, [0.0])
