@@ -20,7 +20,8 @@ import pytest
 import pipeline.jit
 from tests.mutation import ROOMS, TIMEOUT
 
-setattr(pipeline.jit, "_keep_by_all_sources", lambda _kernel, _module: None)  # noqa: B010 - private
+for _name in ("_keep_by_all_sources", "_take_no_constants"):
+    setattr(pipeline.jit, _name, lambda *_: None)
 _LIMIT_S = float(os.environ.get("STEMMAP_TEST_LIMIT_S", "0"))
 _FILE = os.environ.get("STEMMAP_TEST_LINES")
 _SHARED = "fixtures that several tests share"
