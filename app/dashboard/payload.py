@@ -32,9 +32,9 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
     lists [x [m], y [m], yaw [rad]] of `T_map_base` and `T_odom_base`; `sigma_xy`, the root mean square of the
     standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; `health`, `trees`, `clusters`,
     `layers` and `clearance`, the results of the functions of this module; `loops`, pairs of scans,
-    `problems` and `repaired_numbers`, as in `Shown`; `repairs`, the `identity_of` the repairs to which they
-    belong; `intensity`, `has_intensity` of `Shown`; `height_range`, the heights at the ends of the colour
-    ramp [m], see `height_range`; and the keys of `counts_of`.
+    `problems`, `repaired_numbers` and `agreeing`, as in `Shown`; `repairs`, the `identity_of` the repairs to
+    which they belong; `intensity`, `has_intensity` of `Shown`; `height_range`, the heights at the ends of the
+    colour ramp [m], see `height_range`; and the keys of `counts_of`.
 
     Args:
         shown: The scan with the map.
@@ -63,6 +63,7 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         "repairs": identity_of(shown.repairs),
         "problems": list(shown.problems),
         "repaired_numbers": [list(numbers) for numbers in shown.repaired_numbers],
+        "agreeing": [list(stems) for stems in shown.agreeing],
     }
 
 

@@ -428,6 +428,7 @@ class WorkerLoop:
                     loops=shown.loops,
                     repairs=() if repaired is None else shown.repairs,
                     repaired_numbers=() if repaired is None else repaired.numbers,
+                    agreeing=() if repaired is None else repaired.agreeing,
                     reflectance=shown.reflectance,
                     has_intensity=None if run is None else run.has_intensity,
                 )

@@ -263,6 +263,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
         repairs: The repairs to which `problems` belongs.
         repaired_numbers: Numbers of the trees that each of them is about, see `RepairedMap`.
+        agreeing: How many stems agree with each of them, see `RepairedMap`.
         reflectance: Of the raw points, uint8, shape (N,), see `reflectance_of`; None if unknown.
         has_intensity: Whether scans of the run have reflectances; None before the first scan.
     """
@@ -279,6 +280,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     loops: Int = msgspec.field(default_factory=lambda: np.zeros((0, 2), np.int64))
     repairs: tuple[Repair, ...] = ()
     repaired_numbers: tuple[tuple[int, ...], ...] = ()
+    agreeing: tuple[tuple[int, ...], ...] = ()
     reflectance: UInt8 | None = None
     has_intensity: bool | None = None
 

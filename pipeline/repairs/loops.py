@@ -52,11 +52,14 @@ class LoopRepair:
         graph: The graph with the added loops and without the forbidden ones.
         path: Path x, y [m], yaw [rad] after the repairs, shape (N, 3).
         problems: Why each repair does not apply; "" if it does.
+        agreeing: How many stems around each applied tie coincide by its rotation, the tied one among them,
+            and of how many: those of the end with fewer stems; () for other repairs.
     """
 
     graph: KeyframeGraph
     path: Float
     problems: tuple[str, ...]
+    agreeing: tuple[tuple[int, ...], ...]
 
 
 def with_loops(graph: KeyframeGraph, path: Path, repairs: tuple[Repair, ...]) -> LoopRepair:
@@ -69,9 +72,10 @@ def with_loops(graph: KeyframeGraph, path: Path, repairs: tuple[Repair, ...]) ->
     """
     poses = np.column_stack([path.x, path.y, path.yaw])
     graph = replace(graph, pose=poses[graph.scans]) if len(graph.keyframes) else graph
-    problems, ties = list[str](), 0
+    problems, agreeing, ties = list[str](), list[tuple[int, ...]](), 0
     # Forbidden loops first: an added one is always among the last, which have no kernel.
     for repair in sorted(repairs, key=lambda each: each.kind == "tie"):
+        agreeing.append(())
         if len(graph.keyframes) < 2 or max(repair.stamps_ns) > path.stamp_ns[-1]:
             problems.append("the run has not come to this place yet")
             continue
@@ -89,7 +93,8 @@ def with_loops(graph: KeyframeGraph, path: Path, repairs: tuple[Repair, ...]) ->
                 continue
             changed, solved = found, found.solve(added=ties)
         else:
-            changed, solved = _tied(graph, path, poses, repair, ties)
+            changed, solved, stems = _tied(graph, path, poses, repair, ties)
+            agreeing[-1] = stems if solved is not None else ()
         if solved is None:
             problems.append("the graph has no solution with it")
             continue
@@ -98,8 +103,8 @@ def with_loops(graph: KeyframeGraph, path: Path, repairs: tuple[Repair, ...]) ->
         ties += repair.kind == "tie"
         problems.append("")
     order = np.argsort([repair.kind == "tie" for repair in repairs], kind="stable")
-    in_order = [problems[k] for k in np.argsort(order)]
-    return LoopRepair(graph, poses, tuple(in_order))
+    given = np.argsort(order).tolist()
+    return LoopRepair(graph, poses, tuple(problems[k] for k in given), tuple(agreeing[k] for k in given))
 
 
 def _without_loop(graph: KeyframeGraph, path: Path, repair: Repair) -> KeyframeGraph | None:
@@ -136,8 +141,9 @@ def _keyframe(graph: KeyframeGraph, path: Path, stamp_ns: int) -> int:
 
 def _tied(
     graph: KeyframeGraph, path: Path, poses: Float, repair: Repair, ties: int
-) -> tuple[KeyframeGraph, Solution | None]:
-    """Return the graph with a tie, and its solution (None if there is none).
+) -> tuple[KeyframeGraph, Solution | None, tuple[int, int]]:
+    """Return the graph with a tie, its solution (None if there is none), and the numbers of stems of
+    `LoopRepair.agreeing`.
 
     Args:
         graph: The graph with at least two keyframes.
@@ -148,7 +154,7 @@ def _tied(
     order = np.argsort(repair.stamps_ns, kind="stable")
     rows = [_keyframe(graph, path, repair.stamps_ns[k]) for k in order]
     stems = np.array([_in_map(path, poses, repair.stamps_ns[k], repair.places[k]) for k in order])
-    turn, sigma = _rotation(graph, poses, rows, stems)
+    turn, sigma, agreeing = _rotation(graph, poses, rows, stems)
     T_map_stem = Pose2(float(stems[0, 0]), float(stems[0, 1]), turn)
     x, y, yaw = poses[graph.keyframes[rows[1]].scan].tolist()
     T_stem_base = Pose2(x - float(stems[1, 0]), y - float(stems[1, 1]), yaw)
@@ -175,10 +181,10 @@ def _tied(
             break
         reach *= 2.0
     if solution is None:
-        return whole, None
+        return whole, None, agreeing
     for revisit in revisits:
         graph = graph.with_known(whole, revisit, solution)
-    return graph, replace(graph, pose=solution.pose).solve(added=ties + 1)
+    return graph, replace(graph, pose=solution.pose).solve(added=ties + 1), agreeing
 
 
 def _revisits(graph: KeyframeGraph, tied: Float) -> list[Revisit]:
@@ -205,9 +211,12 @@ def _in_map(path: Path, poses: Float, stamp_ns: int, place: tuple[float, float])
     return composed(poses[scan][None], np.array([[*place, 0.0]]))[0, :2]
 
 
-def _rotation(graph: KeyframeGraph, poses: Float, rows: list[int], stems: Float) -> tuple[float, float]:
+def _rotation(
+    graph: KeyframeGraph, poses: Float, rows: list[int], stems: Float
+) -> tuple[float, float, tuple[int, int]]:
     """Return the rotation [rad] of the stems around the later of two keyframes onto those around the earlier
-    one, about the tied stem, and its standard deviation. The rotation is 0 if fewer than LEAST stems agree.
+    one, about the tied stem, its standard deviation, and how many stems agree, of how many that the sparser
+    end has. The rotation is 0 if fewer than LEAST stems agree.
 
     Args:
         graph: The graph.
@@ -219,8 +228,9 @@ def _rotation(graph: KeyframeGraph, poses: Float, rows: list[int], stems: Float)
 
     known = _stems_around(graph, poses, rows[0]) - stems[0]
     seen = _stems_around(graph, poses, rows[1]) - stems[1]
-    if min(len(known), len(seen)) < LEAST:
-        return 0.0, TURN_UNKNOWN
+    most = min(len(known), len(seen))
+    if most < LEAST:
+        return 0.0, TURN_UNKNOWN, (1, most)
     tree = cKDTree(known)
 
     def agreeing(turn: float) -> tuple[Float, Int]:
@@ -237,9 +247,11 @@ def _rotation(graph: KeyframeGraph, poses: Float, rows: list[int], stems: Float)
         if not len(p):
             break
         turn = float(np.arctan2((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum(), (p * q).sum()))
-    if np.count_nonzero(agreeing(turn)[0] < SAME) < LEAST:
-        return 0.0, TURN_UNKNOWN
-    return float(wrap_angle(turn)), TURN_KNOWN
+    away, nearest = agreeing(turn)
+    found = len(np.unique(nearest[away < SAME]))
+    if found < LEAST:
+        return 0.0, TURN_UNKNOWN, (found, most)
+    return float(wrap_angle(turn)), TURN_KNOWN, (found, most)
 
 
 def _stems_around(graph: KeyframeGraph, poses: Float, row: int) -> Float:

@@ -50,6 +50,8 @@ class RepairedMap:
         problems: Why each repair does not apply; "" if it does.
         numbers: Numbers of the trees that each repair is about, in the order of its positions: of trees of
             the map before it, and of "tie" before all repairs. Trees that are not found are left out.
+        agreeing: For each applied "tie", how many stems agree with it, of how many, see `LoopRepair`; () for
+            other repairs.
         loops: Numbers of the scans of both ends of each loop of the path, int64, shape (L, 2).
         correction: Correction of the path; None if it is unchanged.
     """
@@ -58,6 +60,7 @@ class RepairedMap:
     path: Path
     problems: tuple[str, ...]
     numbers: tuple[tuple[int, ...], ...]
+    agreeing: tuple[tuple[int, ...], ...]
     loops: Int
     correction: PathCorrection | None
 
@@ -86,26 +89,35 @@ class Repairer:
             hurried: Whether an earlier repair of the loops may be extended.
         """
         frame, path, correction, loops = run.frame, run.path, None, loops_of(run.graph)
-        of_loop: Iterator[str] = iter(())
+        of_loop: Iterator[tuple[str, tuple[int, ...]]] = iter(())
         if of_loops := tuple(repair for repair in repairs if repair.is_of_loop):
             fixed, known = self._loops(run, of_loops, hurried=hurried)
-            loops, of_loop = loops_of(fixed.graph), iter(fixed.problems)
+            loops, of_loop = loops_of(fixed.graph), zip(fixed.problems, fixed.agreeing, strict=True)
             if "" in fixed.problems:
                 correction = corrected_from(_poses(known), fixed.path, _poses(path))
                 x, y, yaw = (column.copy() for column in correction.after.T)
                 path = Path(path.stamp_ns, x, y, yaw, path.sigma_xy)
                 frame = _moved_frame(frame, _moved_trees(run, correction), correction)
         problems, numbers, trees = list[str](), list[tuple[int, ...]](), frame.trees
+        agreeing = list[tuple[int, ...]]()
         for number, repair in enumerate(repairs):
             if repair.is_of_loop:
-                problems.append(next(of_loop))
+                problem, agree = next(of_loop)
+                agreeing.append(agree)
                 numbers.append(tied_numbers(run.frame.trees, run.path, repair))
             else:
                 numbers.append(numbers_of(trees, repair))
                 trees, problem = repaired_trees(trees, repair, FIRST_ADDED + number)
-                problems.append(problem)
+                agreeing.append(())
+            problems.append(problem)
         return RepairedMap(
-            replace(frame, trees=trees), path, tuple(problems), tuple(numbers), loops, correction
+            replace(frame, trees=trees),
+            path,
+            tuple(problems),
+            tuple(numbers),
+            tuple(agreeing),
+            loops,
+            correction,
         )
 
     def _loops(self, run: MapOfRun, repairs: tuple[Repair, ...], *, hurried: bool) -> tuple[LoopRepair, Path]:

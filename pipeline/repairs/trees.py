@@ -48,14 +48,27 @@ def repaired_trees(trees: Trees, repair: Repair, added: int) -> tuple[Trees, str
             return replace(trees, position=position), ""
         case "class":
             confirmed = trees.confirmed.copy()
-            confirmed[row] = becomes_tree
+            confirmed[[row] if becomes_tree else _at_one_place(trees, row)] = becomes_tree
             return replace(trees, confirmed=confirmed), ""
         case _:
-            return rows_of(trees, np.delete(np.arange(len(trees.number)), row)), ""
+            return rows_of(trees, np.delete(np.arange(len(trees.number)), _at_one_place(trees, row))), ""
+
+
+def _at_one_place(trees: Trees, row: int) -> Int:
+    """Return the rows of a confirmed tree and of those whose stems overlap with its own, which are further
+    copies of one thing: two stems cannot be at one place. An unknown diameter counts as 0."""
+    radius = 0.5 * np.nan_to_num(trees.dbh)
+    away = np.hypot(*(trees.position - trees.position[row]).T)
+    overlaps = trees.confirmed & (away < radius + radius[row])
+    overlaps[row] = True
+    return np.flatnonzero(overlaps)
 
 
 def numbers_of(trees: Trees, repair: Repair) -> tuple[int, ...]:
     """Return the numbers of the trees that a repair of trees is about; those not in the map are left out."""
+    if repair.kind in ("delete", "class") and repair.value != "tree":
+        row = nearest_tree(trees, repair.places[0], confirmed=True)
+        return () if row is None else tuple(trees.number[_at_one_place(trees, row)].tolist())
     places = repair.places if repair.kind == "merge" else repair.places[:1]
     return numbers_at(trees, places, confirmed=repair.value != "tree")
 

@@ -53,7 +53,7 @@ def fit_control_points(
         known: The same points in the reference system: east, north, shape (N, 2) [m].
         names: Names of the points, for messages; by default their numbers.
         point_sigma: Expected standard deviation of a coordinate [m]. A fit whose `sigma_point` is more than
-            CONTRADICTION times this is refused.
+            CONTRADICTION times this is refused, and one of whose points the others exclude.
 
     Raises:
         StemmapError: There are fewer than two points, they are at one position in either frame (RMS distance
@@ -73,7 +73,10 @@ def fit_control_points(
         )
     fit = fit_rigid_pairs(local, known)
     allowed = CONTRADICTION * point_sigma
-    if fit.sigma_point <= allowed:
+    rest = [
+        fit_rigid_pairs(np.delete(local, k, axis=0), np.delete(known, k, axis=0)) for k in range(n) if n > 2
+    ]
+    if fit.sigma_point <= allowed and not _has_outlier(local, known, rest, point_sigma):
         return fit
     if fit_rigid_pairs(a, b[:, ::-1]).sigma_point <= min(allowed, 0.2 * fit.sigma_point) and n > 2:
         raise StemmapError(
@@ -88,7 +91,6 @@ def fit_control_points(
     text = f"the control points contradict one another: {fit.rms:.2f} m (RMS)"
     if n == 2:
         raise StemmapError(text, remedy="Check which tree each point is, and its coordinates")
-    rest = [fit_rigid_pairs(np.delete(local, k, axis=0), np.delete(known, k, axis=0)) for k in range(n)]
     sigmas = np.array([each.sigma_point for each in rest])
     best = int(np.argmin(sigmas))
     if sigmas[best] > allowed:
@@ -104,6 +106,38 @@ def fit_control_points(
         f"point {suspects[0]}" if len(suspects) == 1 else f"the points {', '.join(suspects)}: one is wrong"
     )
     raise StemmapError(text, remedy=f"Check {which}; which tree it is, and its coordinates")
+
+
+def _has_outlier(local: Float, known: Float, rest: Sequence[ControlFit], point_sigma: float) -> bool:
+    """Return whether the fit of the others excludes one of four or more points: it lies CONTRADICTION
+    standard deviations away, with the expected deviation, or with that of the others where it is larger.
+
+    A residual beyond k standard deviations in the plane has the probability p = exp(-k^2 / 2). With a
+    deviation estimated with f degrees of freedom, its square has an F distribution with 2 and f degrees of
+    freedom, whose quantile is (f / 2) (p^(-2 / f) - 1).
+
+    Args:
+        local, known: The points, as in `fit_control_points`.
+        rest: The fit without each point.
+        point_sigma: Expected standard deviation of a coordinate of a point [m].
+    """
+    others = len(local) - 1
+    if others < 3:
+        return False  # two points fit always
+    freedom = 2 * others - 3
+    quantile = 0.5 * freedom * (math.exp(CONTRADICTION**2 / freedom) - 1.0)
+    for k, fit in enumerate(rest):
+        without = np.delete(local, k, axis=0)
+        centre = without.mean(axis=0)
+        spread = max(float(np.square(without - centre).sum()), SPREAD_MIN**2)
+        variance = 1.0 + 1.0 / others + float(np.square(local[k] - centre).sum()) / spread
+        if fit.sigma_point <= point_sigma:
+            allowed = (CONTRADICTION * point_sigma) ** 2
+        else:
+            allowed = 2.0 * quantile * fit.sigma_point**2
+        if float(np.square(known[k] - fit.pose.apply(local[k])).sum()) > allowed * variance:
+            return True
+    return False
 
 
 def _residual_words(residuals: Float, names: Sequence[str]) -> str:

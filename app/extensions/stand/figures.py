@@ -20,6 +20,9 @@ INCH_10 = 25.4  # cm
 # Share of the value below which the known parts of an error say nothing: the trees that the map lacks, which
 # are not among them, are then the larger part.
 NEGLIGIBLE = 0.001
+# Standard errors by which the trees that were found may exceed those that the observed part lets expect: more
+# happens in one of 700 plots whose parts are alike.
+BEYOND = 3.0
 
 
 class Estimate(NamedTuple):
@@ -200,6 +203,16 @@ def stand_figures(
             fit = 0.0 if assumed else total * p_se / p
             spread = math.sqrt((1.0 - share * p) * squares + variance + fit**2)
             values[f"{name}_corrected"] = _scaled(HECTARE / (seen * p), total, spread, assumed)
+    n_ha = values["n_ha"]
+    expected, error = n_ha.value * area / HECTARE, n_ha.se * area / HECTARE
+    if len(every) > expected + BEYOND * error:  # the whole plot has at least the trees that were found in it
+        warnings.append(
+            f"{len(every)} trees were found in the plot, while its observed part lets expect {expected:.0f}: "
+            "it is not like the rest, and the errors of stems, basal area and volume are not known"
+        )
+        for name, _, _ in totals:
+            for each in (name, f"{name}_corrected"):
+                values[each] = Estimate(values[each].value, math.nan)
     found = share * (p if p > 0.0 else 1.0)
     values.update(_diameter_figures(kept, found, seen, parameters))
     values.update(_pattern(kept.position, seen, perimeter))

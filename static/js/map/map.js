@@ -3,7 +3,7 @@
 import { annotating, draft, reviewOf, rows as annotations } from "../annotate/annotations.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "../annotate/pointer.js";
 import { drawSection } from "../annotate/section.js";
-import { fileFrame, inFile, isMetric } from "../core/coordinates.js";
+import { fileFrame, inFile, isMetric, placeText } from "../core/coordinates.js";
 import { byId, setText } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
 import { dbhText, heightText, NONE, seenText } from "../core/format.js";
@@ -52,6 +52,13 @@ const map = new MapCanvas(canvas, {
   },
 });
 
+// Surveyed places are found by the coordinates under the pointer.
+canvas.addEventListener("pointermove", ({ offsetX, offsetY }) => {
+  byId("map-place").hidden = false;
+  setText(byId("map-place"), placeText(map.view.toMap(offsetX, offsetY)));
+});
+canvas.addEventListener("pointerleave", () => { byId("map-place").hidden = true; });
+
 const gapTo = (at) => (place) => {
   const [x, y] = map.view.toScreen(place.x, place.y);
   return Math.hypot(at[0] - x, at[1] - y);
@@ -73,7 +80,7 @@ function describe(at) {
   if (measuring()) return state.measure.from === null ? "Click where the distance begins" : "";
   if (draft.adding || tool.kind || byTool("busy") || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
-  if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isDrive() ? seenText(tree) : `height ${heightText(tree)}`);
+  if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, `at ${placeText([tree.x, tree.y])}`, isDrive() ? seenText(tree) : `height ${heightText(tree)}`);
   else if (cluster) lines.push(`${isDrive() ? "Cluster" : "Candidate"}: ${cluster.verdict === "tree" && isDrive() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
   if (truth) lines.push(`${annotations().some((row) => distance(row, truth) < SAME) ? "Annotation" : "Ground truth"}: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
   return lines.join("\n") || NONE;

@@ -1,14 +1,14 @@
 // The tab Repair: tools for trees and loops, and the list of repairs.
 
 import { draft, historyOf } from "../annotate/annotations.js";
-import { inFile, unitWord } from "../core/coordinates.js";
+import { inFile, placeTexts, unitWord } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { count } from "../core/format.js";
 import { on, selectedTree, state } from "../core/store.js";
 import { CLASSES, deleteTree, endTool, hint, importRepairs, removeRepair, repairing, repairs, setClass, startRepairs, tool, useTool } from "./repairs.js";
 
 const TOOLS = [
-  ["merge", "Merge", "Two trees of the map are one: the second one becomes part of the first"],
+  ["merge", "Merge", "Two trees of the map are one: it keeps the number of the first; its place is the mean of both, weighted by their sigmas"],
   ["split", "Split", "A tree of the map is two stems; their diameters are unknown then"],
   ["move", "Move", "A tree stands elsewhere"],
 ];
@@ -18,10 +18,11 @@ const LOOPS = [
 ];
 // What a repair asks for, also while it is not applied.
 const WORDS = { merge: "merge two trees", split: "split a tree", move: "move a tree", class: "class", delete: "delete a tree", tie: "same place", forbid: "forbid a loop" };
-// What an applied repair did to the trees with the numbers a and b.
+const listed = (numbers) => (numbers.length > 1 ? `trees ${numbers.join(" and ")}` : `tree ${numbers[0]}`); // copies of one thing go together
+// What an applied repair did to the trees with these numbers.
 const DONE = {
-  merge: (a, b) => b && `tree ${b} merged into tree ${a}`, split: (a) => `tree ${a} split`, move: (a) => `tree ${a} moved`, class: (a, b, value) => `tree ${a}: class ${value}`,
-  delete: (a) => `tree ${a} deleted`, tie: (a, b) => b && (a === b ? `tree ${a} at the same place` : `same place: trees ${a} and ${b}`), forbid: () => "",
+  merge: ([a, b]) => b && `tree ${b} merged into tree ${a}`, split: ([a]) => `tree ${a} split`, move: ([a]) => `tree ${a} moved`, class: (all, value) => `${listed(all)}: class ${value}`,
+  delete: (all) => `${listed(all)} deleted`, tie: ([a, b]) => b && (a === b ? `tree ${a} at the same place` : `same place: trees ${a} and ${b}`), forbid: () => "",
 };
 const { undo, redo, canUndo, canRedo } = historyOf("repair");
 const LARGEST_FILE = 900_000; // [bytes]
@@ -56,8 +57,8 @@ function build() {
 }
 
 // In the words of the trees where it is applied, else of the place.
-function wordsOf(row, [a, b] = []) {
-  const done = a !== undefined && DONE[row.kind](a, b, row.value);
+function wordsOf(row, numbers = []) {
+  const done = numbers.length > 0 && DONE[row.kind](numbers, row.value);
   if (done) return done;
   const place = isOfLoop(row) ? "" : ` at ${placeText(row)}`;
   return `${WORDS[row.kind]}${row.value ? ` ${row.value}` : ""}${place}`;
@@ -66,10 +67,18 @@ function wordsOf(row, [a, b] = []) {
 const isOfLoop = ({ kind }) => ["tie", "forbid"].includes(kind); // its positions are in the frame of the robot
 const placeText = (row) => inFile(...row.places[0]).map((v) => v.toFixed(1)).join(", ");
 
-function lineOf(row, problem, numbers) {
+// How many stems around a tie confirm it; of a wrong one, few do.
+const LEAST_AGREEING = 0.5; // of the stems; below it the line warns
+function agreeingOf([agree, all] = []) {
+  if (!all) return [];
+  const warns = agree < LEAST_AGREEING * all;
+  return [el("br"), el("span", { class: warns ? "warned" : "dim", text: `${agree} of ${count(all, "stem")} there agree${warns ? ": perhaps it is another place" : ""}.` })];
+}
+
+function lineOf(row, problem, numbers, agreeing) {
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete this repair", "aria-label": `Delete repair ${row.id}`, "data-edit": true, onclick: () => removeRepair(row) });
   return el("li", { "data-repair": row.id, class: problem ? "problem" : "", title: isOfLoop(row) ? "" : `at ${placeText(row)} ${unitWord()}` },
-    el("span", { class: "grow" }, wordsOf(row, problem ? [] : numbers), ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
+    el("span", { class: "grow" }, wordsOf(row, problem ? [] : numbers), ...agreeingOf(agreeing), ...(problem ? [el("br"), el("span", { class: "warned", text: `Not applied: ${problem}.` })] : [])),
     el("span", { class: "dim", text: row.who }), gone);
 }
 
@@ -88,14 +97,14 @@ function fill() {
   }
   for (const id of ["repair-class", "repair-delete"]) byId(id).disabled = blocked || !selectedTree();
   const tree = selectedTree();
-  setText(byId("repair-hint"), hint() || (tree ? `Tree ${tree.number} is selected.` : "Select a tree on the map, or press a tool. The recording is unchanged; each repair can be undone."));
+  setText(byId("repair-hint"), hint() || (tree ? `Tree ${tree.number} is selected, at ${placeTexts([tree.x, tree.y]).join(", ")} ${unitWord()}.` : "Select a tree on the map, or press a tool. The recording is unchanged; each repair can be undone."));
   setText(byId("repair-error"), state.annotations?.problem || draft.error);
   byId("repair-error").hidden = !byId("repair-error").textContent;
-  const list = byId("repairs"), numbers = known ? state.map.repaired_numbers : [];
-  const now = JSON.stringify([rows.map(({ id, version }) => [id, version]), known && problems, numbers]);
+  const list = byId("repairs"), numbers = known ? state.map.repaired_numbers : [], agreeing = known ? state.map.agreeing : [];
+  const now = JSON.stringify([rows.map(({ id, version }) => [id, version]), known && problems, numbers, agreeing]);
   if (list.dataset.now === now) return; // the focus stays in the list
   list.dataset.now = now;
-  list.replaceChildren(...rows.map((row, k) => lineOf(row, known ? problems[k] : "", numbers[k])).reverse());
+  list.replaceChildren(...rows.map((row, k) => lineOf(row, known ? problems[k] : "", numbers[k], agreeing[k])).reverse());
 }
 
 export const REPAIR_KEYS = [["del", "in the tab Repair: delete the selected tree from the map"]];

@@ -121,6 +121,7 @@ function sayIfDoubtful(a, b) {
 
 function finish(fields) {
   endTool();
+  if (fields.kind !== "split") select(null); // else the next tool would begin with it; a split is mostly followed by a move
   add(fields);
 }
 

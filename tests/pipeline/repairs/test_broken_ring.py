@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from pipeline.config import preset
+from pipeline.geometry.columns import rows_of
 from pipeline.geometry.poses import Pose2
 from pipeline.repairs.record import Kind, Repair, parse_repairs, repairs_text, seen_from
 from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer, _joined
+from pipeline.repairs.trees import numbers_of, repaired_trees
 from pipeline.types.records import Float
 from tests.benchmarks.broken_ring import DOUBLE, GHOSTS, POLES, TWIN, FaultyRing
 from tests.benchmarks.wide_ring import NS, mapped
@@ -204,3 +206,48 @@ def test_repairs_without_their_trees_or_places_say_so():
     assert "not come to this place" in found.problems[4]
     assert "begins after this place" in found.problems[5]
     assert len(found.frame.trees.number) == len(of.frame.trees.number)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_stems_around_a_tie_tell_a_wrong_one(seed):
+    of, truth = run(seed)
+    person = Person(of)
+    person.tie(FaultyRing().scene(np.random.default_rng([9, seed]))[0], truth)
+    (right,) = person.repairs
+    ((agree, of_all),) = person.shown.agreeing
+    assert agree > 0.8 * of_all
+    x, y = seen_place(of, right)
+    trees = of.frame.trees
+    away = np.hypot(*(trees.position - [x, y]).T)
+    for row in np.argsort(away)[1:4]:  # stems beside the right one
+        view = seen_from(trees, of.path, tuple(trees.position[row].tolist()))
+        assert view is not None
+        wrong = Person(of)
+        wrong.repairs.append(Repair("tie", (right.places[0], view[1]), (right.stamps_ns[0], view[0])))
+        ((agree, of_all),) = wrong.shown.agreeing
+        assert agree < 0.4 * of_all
+
+
+def seen_place(of: MapOfRun, tie: Repair) -> Float:
+    """Return where the second stem of a tie stands in the map before it [m]."""
+    scan = int(np.searchsorted(of.path.stamp_ns, tie.stamps_ns[1]))
+    pose = Pose2(of.path.x[scan], of.path.y[scan], of.path.yaw[scan])
+    place: Float = pose.apply(np.array(tie.places[1]))
+    return place
+
+
+def test_a_deleted_thing_is_gone_with_its_copies():
+    of, _ = run(0)
+    trees = of.frame.trees
+    row = int(np.flatnonzero(trees.confirmed)[0])
+    copies = rows_of(trees, np.append(np.arange(len(trees.number)), row))
+    copies.number[-1] = trees.number.max() + 1
+    copies.position[-1] += [0.05, 0.03]  # m; the stems overlap
+    x, y = trees.position[row].tolist()
+    for repair in (Repair("delete", ((x, y),)), Repair("class", ((x, y),), value="pole")):
+        assert set(numbers_of(copies, repair)) == {trees.number[row], copies.number[-1]}
+        after, problem = repaired_trees(copies, repair, 100_001)
+        assert problem == ""
+        left = after.position[after.confirmed]
+        assert np.hypot(*(left - [x, y]).T).min() > 0.5
+        assert np.count_nonzero(after.confirmed) == np.count_nonzero(trees.confirmed) - 1

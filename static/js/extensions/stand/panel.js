@@ -52,7 +52,7 @@ const refresh = keepFresh(async () => {
 // --- the controls ---------------------------------------------------------------------------------------------------
 
 const number = (name, value, title, min = null, max = null) => el("input", { type: "number", name, value, min, max, step: "any", required: true, "aria-label": title, title });
-const numberOf = (form, name) => Number(form.elements[name].value);
+const numberOf = (form, name) => Number(form.elements.namedItem(name).value); // `elements.length` is their number
 
 function typed() {
   const kind = el("select", { name: "kind", "aria-label": "Shape", onchange: () => fields.replaceChildren(...made(kind.value)) }, ...Object.keys(FIELDS).map((each) => el("option", { value: each, text: each })));

@@ -98,6 +98,30 @@ def test_a_greater_sigma_allows_greater_residuals():
     assert fit_control_points(SQUARE, known, point_sigma=1.0).rms > 0.5
 
 
+def test_one_wrong_point_among_good_ones_is_named_though_the_residuals_are_small():
+    """The least-squares fit spreads an error of 1.47 m over four points: no coordinate is off by 0.5 m."""
+    random = np.random.default_rng(3)
+    known = Pose2(470600.0, 4070100.0, 0.4).apply(SQUARE) + random.normal(0.0, 0.04, SQUARE.shape)
+    assert fit_control_points(SQUARE, known).rms < 0.1
+    known[2] += [1.3, -0.7]
+    assert fit_rigid_pairs(SQUARE, known).sigma_point < 0.6
+    with pytest.raises(StemmapError, match="contradict") as error:
+        fit_control_points(SQUARE, known, names="abcd")
+    assert "point c" in error.value.remedy
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.12])
+def test_good_points_are_seldom_refused(sigma):
+    random, refused = np.random.default_rng(4), 0
+    for _ in range(300):
+        local = random.uniform(0.0, 30.0, (random.integers(4, 8), 2))
+        try:
+            fit_control_points(local, local + random.normal(0.0, sigma, local.shape))
+        except StemmapError:
+            refused += 1
+    assert refused <= 2  # 1 in 3000 for each point
+
+
 def test_points_at_one_place_leave_the_turn_unknown():
     local, known = np.full((2, 2), 3.0), np.array([[10.0, 0.0], [12.0, 0.0]])
     fit = fit_rigid_pairs(local, known)
