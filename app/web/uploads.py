@@ -32,6 +32,7 @@ _STALLED_S = 60.0
 _ABANDONED_S = 3600.0
 _PART = ".upload-"
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}\Z")
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]+")  # letters of other names, dots and separators
 # A drive of KITTI has 4,541 scans; their list takes 0.2 MB.
 _MOST_FILES, _LONGEST_LIST, _DEEPEST = 20_000, 4 << 20, 4
 _LONGEST_NAME = 60  # 240 bytes in UTF-8, below the 255 of file systems
@@ -112,7 +113,8 @@ class Uploads:
         try:
             await self._write(part, size, stream, many)
             kind = await _look_at(part, name)
-            made_up = f"upload-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}{suffix}"
+            stem = _UNSAFE.sub("_", Path(_shown(name)).stem)[:_LONGEST_NAME]  # files and reports name it
+            made_up = f"upload-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}-{stem}{suffix}"
             place = part.with_name(made_up)
             part.rename(place)
         except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import shutil
 import socket
 import time
@@ -62,7 +63,7 @@ async def test_a_recording_is_kept_under_a_made_up_name_and_offered(recordings: 
         )
         place = Path(told["uri"])
         assert place.parent == recordings
-        assert place.name.startswith("upload-")
+        assert re.fullmatch(r"upload-\d{8}-\d{6}-[0-9a-f]{6}-[\w-]*(\.\w+)?", place.name, re.ASCII)
         assert place.suffix == ".mcap"
         assert place.read_bytes() == content
         assert kept(recordings) == [place.name]

@@ -109,6 +109,21 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     expect(rows).to_have_count(0)
 
 
+def test_a_typed_rectangle_is_a_plot(person: Dashboard) -> None:
+    page = person.page
+    page.get_by_text("Type a plot").click()
+    form = page.locator(".plot-form").first
+    form.locator("[name=kind]").select_option("rectangle")
+    form.locator("[name=length]").fill("6")
+    form.locator("[name=width]").fill("4.5")
+    form.get_by_role("button", name="Add", exact=True).click()
+    person.until_server("/api/annotations", "it.others.plot?.length === 1")
+    shape = person.ask("/api/annotations")["others"]["plot"][0]["shape"]
+    assert (shape["kind"], shape["length"], shape["width"]) == ("rectangle", 6.0, 4.5)
+    page.locator("#plot-undo").click()
+    person.until_server("/api/annotations", "!it.others.plot?.length")
+
+
 def test_another_run_begins_with_empty_fields(person: Dashboard) -> None:
     page = person.page
     page.get_by_text("Type a plot").click()
