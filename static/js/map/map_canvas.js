@@ -118,6 +118,7 @@ export class MapCanvas {
 
   zoom(factor, [px, py] = [this.view.width / 2, this.view.height / 2]) {
     this.view.zoom(factor, px, py);
+    if (this.tip) this.tip.hidden = true; // what it describes has moved
     this.redraw();
   }
 
