@@ -24,6 +24,7 @@ const evidence = () => byId("review-evidence");
 // a selected tree, too.
 export const card = (answers, hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
   el("div", { id: "review-evidence" }),
+  el("p", { id: "review-refused", class: "review-refused", hidden: true }),
   el("div", { class: "review-side" },
     el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" }),
       button("review-story", "Story", "Why the mapping decided so, with the figures behind it", () => openTab("story"), "quiet small")),
@@ -133,6 +134,8 @@ export function fillCard() {
   const tree = selectedTree();
   byId("review").classList.toggle("empty-card", !tree);
   byId("review-more").hidden = !tree;
+  byId("review-refused").hidden = !tree || !draft.refused;
+  setText(byId("review-refused"), draft.refused);
   if (!tree) {
     shown = "";
     pictured = draft.shown = null;
