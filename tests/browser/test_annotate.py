@@ -671,27 +671,44 @@ def test_a_tree_that_is_selected_again_while_its_evidence_loads_is_shown(person:
     expect(page.locator("#review-title")).to_have_text(f"Tree {tree}")
 
 
-def test_a_dbh_on_the_card_confirms_an_open_tree_and_corrects_a_reviewed_one(person: Dashboard):
+def test_a_dbh_is_an_answer_and_gives_the_keys_back_to_the_review(person: Dashboard):
     page = person.page
     number = next(tree["number"] for tree in person.ask("/api/trees")["trees"] if tree["dbh_cm"] is not None)
     page.evaluate(f"import('/static/js/core/live_feed.js').then(({{ select }}) => select({number}))")
     field = page.locator("#review-dbh")
     expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
     expect(field).to_have_attribute("placeholder", re.compile(r"mapped [\d.]+"))
+    wrong = page.locator("#review-dbh-error")
     field.fill("wide")
     field.press("Enter")
-    expect(page.locator("#annotate-error")).to_contain_text("“wide” is not a DBH")
+    expect(wrong).to_contain_text("“wide” is not a DBH")
+    expect(wrong).to_be_in_viewport()
+    expect(field).to_be_focused()
+    expect(field).to_have_value("wide")
+    field.press("Escape")
+    expect(field).not_to_be_focused()
+    expect(field).to_have_value("")
+    expect(wrong).to_be_empty()
     assert rows(person) == []
 
+    # Enter stores it, goes on to the next tree, and the next key answers for that.
     field.fill("25,4")
     field.press("Enter")
-    expect(page.locator("#review-state")).to_have_text("confirmed")
-    expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
-    assert [(row["kind"], row["dbh_cm"]) for row in rows(person)] == [("tree", 25.4)]
+    expect(field).not_to_be_focused()
+    expect(page.locator("#review-title")).not_to_have_text(f"Tree {number}")
+    expect(page.locator("#review-title")).to_be_in_viewport()
+    person.card_shown()
+    page.keyboard.press("n")
+    person.until_server("/api/annotations", "it.trees.length === 2")
+    assert [(row["kind"], row["dbh_cm"]) for row in rows(person)] == [("tree", 25.4), ("other", None)]
 
+    # A correction; who leaves the field by the pointer stays at the tree.
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(({{ select }}) => select({number}))")
+    expect(field).to_have_value("25.4")
     field.fill("")
-    field.press("Enter")
+    page.locator("#annotate-count").click()
     person.until_server("/api/annotations", "it.trees[0].dbh_cm === null")
+    expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
     expect(page.locator("#annotate-error")).to_be_hidden()
 
 

@@ -305,7 +305,7 @@ export const byClick = (answers) => (event) => {
   else answers();
 };
 
-async function answer(tree, kind) {
+async function answer(tree, kind, fields = {}, goesOn = true) {
   const { number } = tree, seen = annotationOf(tree);
   answering.add(number);
   Object.assign(draft, { answer: { number, kind }, kind: "other", refused: "" });
@@ -315,12 +315,12 @@ async function answer(tree, kind) {
     const row = annotationOf(tree); // after the edits before this one
     const isSeen = row && row.id === seen?.id && row.version === seen.version;
     if (row && !isSeen && row.who !== myName()) throw new Error(`Tree ${number} was annotated by ${row.who} meanwhile; your answer was not stored.`);
-    return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind } : { kind })
-      : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null });
+    return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind, ...fields } : { kind, ...fields })
+      : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null, ...fields });
   });
   const given = draft.answer;
   try {
-    if (state.selected === number) await next();
+    if (goesOn && state.selected === number) await next();
     if (!await stored) {
       if (draft.answer === given) draft.answer = null; // not that of a later tree
       if (!before.includes(number)) draft.answered = draft.answered.filter((each) => each !== number);
@@ -341,10 +341,10 @@ export function typedDbh(typed) {
 }
 
 // Stores the DBH of a found tree [cm]. An open or skipped tree becomes confirmed; a rejected one stays rejected.
-export function measureDbh(tree, dbh) {
+export function measureDbh(tree, dbh, goesOn) {
   const row = annotationOf(tree);
-  if (row) return change(row, { dbh_cm: dbh, ...(row.kind === SKIPPED ? { kind: "tree" } : {}) });
-  return dbh === null ? null : add({ x: tree.x, y: tree.y, dbh_cm: dbh });
+  if (row ? row.dbh_cm === dbh : dbh === null) return null;
+  return answer(tree, isReviewed(tree) ? row.kind : "tree", { dbh_cm: dbh }, goesOn);
 }
 
 // Marks the tree on the card as skipped if it is open, and goes on to the next one.
