@@ -383,6 +383,147 @@ def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard)
     assert person.errors == []
 
 
+# How many rings of the selection the map draws.
+RINGS = """async () => {
+  const [{ changed }, { colours }] = await Promise.all([
+    import('/static/js/core/store.js'), import('/static/js/core/theme.js'),
+  ]);
+  const pen = document.getElementById('map').getContext('2d');
+  const ring = document.createElement('canvas').getContext('2d');
+  ring.strokeStyle = colours.selection;
+  let rings = 0;
+  pen.stroke = function () {
+    rings += this.strokeStyle === ring.strokeStyle && this.lineWidth === 3;
+    CanvasRenderingContext2D.prototype.stroke.call(this);
+  };
+  changed('annotating');
+  await new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
+  delete pen.stroke;
+  return rings;
+}"""
+
+
+def test_a_chosen_annotation_and_the_card_are_one_selection(person: Dashboard):
+    page = person.page
+    canvas, title = page.locator("#map"), page.locator("#review-title")
+    first, second = doubted(person)[:2]
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({first['number']}))")
+    for tree in (first, second):
+        expect(title).to_have_text(f"Tree {tree['number']}")
+        person.answer("y")
+    person.until_server("/api/annotations", "it.trees.length === 2")
+    page.get_by_role("button", name="Fit").click()
+    person.drawn()
+
+    # On the map.
+    canvas.click(position=place_of(person, first["x"], first["y"]))
+    expect(title).to_have_text(f"Tree {first['number']}")
+    assert page.evaluate(RINGS) == 1
+    person.answer("Shift+P")
+    person.until_server("/api/annotations", "it.trees.some(row => row.kind === 'pole')")
+    assert [row["kind"] for row in rows(person)] == ["pole", "tree"]
+
+    # In the table.
+    row = page.locator("#annotations tbody tr").filter(has_text=str(second["number"])).first
+    row.click(position={"x": 5, "y": 5})
+    expect(title).to_have_text(f"Tree {second['number']}")
+    expect(row).to_have_attribute("aria-selected", "true")
+    assert page.evaluate(RINGS) == 1
+    person.answer("Shift+H")
+    person.until_server("/api/annotations", "it.trees.some(row => row.kind === 'person')")
+    assert [row["kind"] for row in rows(person)] == ["pole", "person"]
+
+    # An added object without a tree has no card: the keys set its own class.
+    page.evaluate("import('/static/js/annotate/annotations.js').then(it => it.add({ x: 4, y: 30 }))")
+    expect(title).to_be_hidden()
+    expect(page.locator("#annotate-hint")).to_contain_text("belongs to no found tree")
+    assert page.evaluate(RINGS) == 1
+    canvas.press("Shift+B")
+    person.until_server("/api/annotations", "it.trees[2]?.kind === 'bush'")
+    assert [row["kind"] for row in rows(person)] == ["pole", "person", "bush"]
+    canvas.press("s")
+    expect(title).to_be_visible()
+    assert page.evaluate(RINGS) == 1
+    person.answer("y")
+    person.until_server("/api/annotations", "it.trees.length === 4")
+    assert [row["kind"] for row in rows(person)] == ["pole", "person", "bush", "tree"]
+    assert person.errors == []
+
+
+def test_an_answer_counts_only_while_the_card_is_in_view(person: Dashboard):
+    page = person.page
+    canvas, refused = page.locator("#map"), page.locator("#review-refused")
+    page.set_viewport_size({"width": 1280, "height": 720})
+    first, second = doubted(person)[:2]
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({first['number']}))")
+    person.card_shown()
+    expect(page.locator("#review-votes > *")).to_be_attached()
+    page.get_by_role("button", name="Fit").click()
+    person.drawn()
+    scroll = "document.querySelector('#panel-annotate').scrollTop = 1e4"
+    for key in ("y", "n", "s", "Shift+P"):
+        page.evaluate(scroll)
+        expect(page.locator("#review-title")).not_to_be_in_viewport()
+        canvas.press(key)
+        text = f"Not counted: the card of tree {first['number']} was out of view."
+        expect(refused).to_have_text(text)
+        expect(page.locator("#problem")).to_contain_text(text)
+        expect(page.locator("#review-title")).to_be_in_viewport()
+        expect(page.locator("#review-evidence svg").first).to_be_in_viewport()
+    page.evaluate(scroll)
+    canvas.click(position=place_of(person, second["x"], second["y"]))
+    expect(page.locator("#review-title")).to_have_text(f"Tree {second['number']}")
+    expect(page.locator("#review-title")).to_be_in_viewport()
+    expect(refused).to_be_hidden()
+    assert rows(person) == []
+    person.answer("y")
+    person.until_server("/api/annotations", "it.trees.length === 1 && it.skipped.length === 0")
+    assert person.errors == []
+
+
+# The first or second click on Yes, at a time [ms] that does not depend on the speed of the machine.
+CLICK = """([detail, timeStamp]) => {
+  const click = new MouseEvent('click', { bubbles: true, detail });
+  Object.defineProperty(click, 'timeStamp', { value: timeStamp });
+  document.getElementById('annotate-yes').dispatchEvent(click);
+}"""
+
+
+def test_the_second_click_of_a_double_click_answers_nothing(person: Dashboard):
+    page = person.page
+    first, second = doubted(person)[:2]
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({first['number']}))")
+    person.card_shown()
+    page.evaluate(CLICK, [1, 1000])
+    person.card_shown()
+    page.evaluate(CLICK, [2, 1250])
+    expect(page.locator("#review-refused")).to_contain_text("Not counted: the second click")
+    expect(page.locator("#review-title")).to_have_text(f"Tree {second['number']}")
+    person.until_server("/api/annotations", "it.trees.length === 1")
+    page.locator("#annotate-no").click()
+    expect(page.locator("#review-refused")).to_be_hidden()
+    person.until_server("/api/annotations", "it.trees.length === 2")
+    assert [row["kind"] for row in rows(person)] == ["tree", "other"]
+    assert person.errors == []
+
+
+def test_the_class_of_a_rejected_tree_holds_for_that_tree_only(person: Dashboard):
+    page, kind = person.page, person.page.locator("#annotate-kind")
+    first, second = doubted(person)[:2]
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({first['number']}))")
+    person.card_shown()
+    kind.select_option("bush")
+    person.answer("n")
+    expect(page.locator("#review-title")).to_have_text(f"Tree {second['number']}")
+    expect(kind).to_have_value("other")
+    person.answer("n")
+    person.until_server("/api/annotations", "it.trees.length === 2")
+    assert [row["kind"] for row in rows(person)] == ["bush", "other"]
+    kind.select_option("pole")
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({first['number']}))")
+    expect(kind).to_have_value("other")  # the pole was another tree
+
+
 def test_edits_that_wait_while_another_run_is_opened_are_not_made_in_it(person: Dashboard):
     told = person.page.evaluate(OTHER_RUN)
     assert told == {"made": [1], "error": "Another run was opened meanwhile: this edit belongs to the one "
@@ -530,27 +671,44 @@ def test_a_tree_that_is_selected_again_while_its_evidence_loads_is_shown(person:
     expect(page.locator("#review-title")).to_have_text(f"Tree {tree}")
 
 
-def test_a_dbh_on_the_card_confirms_an_open_tree_and_corrects_a_reviewed_one(person: Dashboard):
+def test_a_dbh_is_an_answer_and_gives_the_keys_back_to_the_review(person: Dashboard):
     page = person.page
     number = next(tree["number"] for tree in person.ask("/api/trees")["trees"] if tree["dbh_cm"] is not None)
     page.evaluate(f"import('/static/js/core/live_feed.js').then(({{ select }}) => select({number}))")
     field = page.locator("#review-dbh")
     expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
     expect(field).to_have_attribute("placeholder", re.compile(r"mapped [\d.]+"))
+    wrong = page.locator("#review-dbh-error")
     field.fill("wide")
     field.press("Enter")
-    expect(page.locator("#annotate-error")).to_contain_text("“wide” is not a DBH")
+    expect(wrong).to_contain_text("“wide” is not a DBH")
+    expect(wrong).to_be_in_viewport()
+    expect(field).to_be_focused()
+    expect(field).to_have_value("wide")
+    field.press("Escape")
+    expect(field).not_to_be_focused()
+    expect(field).to_have_value("")
+    expect(wrong).to_be_empty()
     assert rows(person) == []
 
+    # Enter stores it, goes on to the next tree, and the next key answers for that.
     field.fill("25,4")
     field.press("Enter")
-    expect(page.locator("#review-state")).to_have_text("confirmed")
-    expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
-    assert [(row["kind"], row["dbh_cm"]) for row in rows(person)] == [("tree", 25.4)]
+    expect(field).not_to_be_focused()
+    expect(page.locator("#review-title")).not_to_have_text(f"Tree {number}")
+    expect(page.locator("#review-title")).to_be_in_viewport()
+    person.card_shown()
+    page.keyboard.press("n")
+    person.until_server("/api/annotations", "it.trees.length === 2")
+    assert [(row["kind"], row["dbh_cm"]) for row in rows(person)] == [("tree", 25.4), ("other", None)]
 
+    # A correction; who leaves the field by the pointer stays at the tree.
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(({{ select }}) => select({number}))")
+    expect(field).to_have_value("25.4")
     field.fill("")
-    field.press("Enter")
+    page.locator("#annotate-count").click()
     person.until_server("/api/annotations", "it.trees[0].dbh_cm === null")
+    expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
     expect(page.locator("#annotate-error")).to_be_hidden()
 
 

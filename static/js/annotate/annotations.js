@@ -19,8 +19,12 @@ export const STATES = ["open", "confirmed", "rejected", "skipped"]; // of a foun
 const LARGEST_DBH = 1000; // [cm]
 const MOST_ANSWERED = 20; // answers to which the review returns
 // [ms] for which a card must have been on the screen before it is answered: what takes less is no judgement of its picture. People
-// need about 150 ms to recognise the content of a picture (Thorpe, Fize and Marlot, Nature 381, 1996).
+// need about 150 ms to recognise the content of a picture (Thorpe, Fize and Marlot, Nature 381, 1996). A choice between two answers
+// takes about 300 ms from the picture to the key (Donders 1868, Hick 1952), but three answers per second leave 333 ms between two
+// keys, of which the next card needs a part.
 const LOOK = 150;
+// [ms] between two clicks on the answers that are one double click: the default of GTK (gtk-double-click-time).
+const DOUBLE_CLICK = 400;
 export const NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .@-]{0,39}$/u;
 
 export const draft = {
@@ -34,6 +38,7 @@ export const draft = {
   answer: null, // {number, kind} of the last answer of the review
   answered: [], // numbers of the trees that were answered, the newest last
   error: "",
+  refused: "", // why the last answer did not count
   undo: {}, // numbers of edits that can be undone, by their subject
   redo: {},
 };
@@ -106,12 +111,12 @@ function arrived(serial) {
   });
 }
 
-export function add(content) {
-  return edit(async () => {
-    const done = await call("POST", "", { kind: "tree", dbh_cm: null, ...content });
-    draft.chosen = done.id;
-    return done;
-  });
+// The new annotation is chosen unless another tree was selected meanwhile.
+export async function add(content) {
+  const before = state.selected;
+  const done = await edit(() => call("POST", "", { kind: "tree", dbh_cm: null, ...content }));
+  if (done && state.selected === before) choose(done.id);
+  return done;
 }
 
 // An annotation, also that of a skipped tree.
@@ -255,7 +260,8 @@ const updateVotes = throttled(async () => {
 // Answers whether the tree on the card is a tree, and goes on to the next one at once. Nothing is answered while the card loads or
 // has just come, because the person has not seen that tree yet, or while the answer before is on its way.
 export async function review(kind) {
-  const tree = selectedTree();
+  const tree = selectedTree(), row = rowOf(draft.chosen);
+  if (!tree && row) return change(row, { kind }); // an annotation without a tree
   if (!tree) {
     draft.error = "Select a found tree first: click it on the map, or press S for the next one.";
     return news();
@@ -265,30 +271,56 @@ export async function review(kind) {
 
 async function answerIfSeen(tree, kind) {
   const { number } = tree;
-  if (answering.has(number)) showNews(`Not counted: the answer before on tree ${number} is being stored.`);
-  else if (draft.shown !== number) showNews(`Not counted: tree ${number} was still loading.`);
-  else if (performance.now() - draft.shownAt < LOOK) showNews(`Not counted: tree ${number} had only just come into view.`);
+  if (answering.has(number)) refuse(`the answer before on tree ${number} is being stored`);
+  else if (draft.shown !== number) refuse(`tree ${number} was still loading`);
+  else if (!isInView(byId("review-title")) || !isInView(byId("review-evidence"))) {
+    showCard();
+    draft.shownAt = performance.now();
+    refuse(`the card of tree ${number} was out of view`);
+  } else if (performance.now() - draft.shownAt < LOOK) refuse(`tree ${number} had only just come into view`);
   else await answer(tree, kind);
 }
 
-export const sayHeld = () => showNews("Not counted: a key that is held down answers once.");
+function refuse(why) {
+  draft.refused = `Not counted: ${why}.`;
+  showNews(draft.refused);
+  news();
+}
 
-async function answer(tree, kind) {
+export const refuseHeld = () => refuse("a key that is held down answers once");
+
+// Whether the middle of a node is neither scrolled away nor covered, except by the line that tells why an answer did not count.
+function isInView(node) {
+  const { left, top, width, height } = node.getBoundingClientRect();
+  const seen = document.elementsFromPoint(left + width / 2, top + height / 2).find((each) => !each.closest("#problem"));
+  return Boolean(seen) && node.contains(seen);
+}
+
+// Answers by a click, unless it is the second one of a double click: that was meant for the tree before.
+let clickedAt = -Infinity;
+export const byClick = (answers) => (event) => {
+  const isDouble = event.detail > 0 && event.timeStamp - clickedAt < DOUBLE_CLICK; // 0: by a key
+  if (event.detail > 0) clickedAt = event.timeStamp;
+  if (isDouble) refuse("the second click of a double click answers nothing");
+  else answers();
+};
+
+async function answer(tree, kind, fields = {}, goesOn = true) {
   const { number } = tree, seen = annotationOf(tree);
   answering.add(number);
-  draft.answer = { number, kind };
+  Object.assign(draft, { answer: { number, kind }, kind: "other", refused: "" });
   const before = draft.answered;
   draft.answered = [...before.filter((each) => each !== number), number].slice(-MOST_ANSWERED);
   const stored = edit(async () => {
     const row = annotationOf(tree); // after the edits before this one
     const isSeen = row && row.id === seen?.id && row.version === seen.version;
     if (row && !isSeen && row.who !== myName()) throw new Error(`Tree ${number} was annotated by ${row.who} meanwhile; your answer was not stored.`);
-    return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind } : { kind })
-      : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null });
+    return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind, ...fields } : { kind, ...fields })
+      : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null, ...fields });
   });
   const given = draft.answer;
   try {
-    if (state.selected === number) await next();
+    if (goesOn && state.selected === number) await next();
     if (!await stored) {
       if (draft.answer === given) draft.answer = null; // not that of a later tree
       if (!before.includes(number)) draft.answered = draft.answered.filter((each) => each !== number);
@@ -309,10 +341,10 @@ export function typedDbh(typed) {
 }
 
 // Stores the DBH of a found tree [cm]. An open or skipped tree becomes confirmed; a rejected one stays rejected.
-export function measureDbh(tree, dbh) {
+export function measureDbh(tree, dbh, goesOn) {
   const row = annotationOf(tree);
-  if (row) return change(row, { dbh_cm: dbh, ...(row.kind === SKIPPED ? { kind: "tree" } : {}) });
-  return dbh === null ? null : add({ x: tree.x, y: tree.y, dbh_cm: dbh });
+  if (row ? row.dbh_cm === dbh : dbh === null) return null;
+  return answer(tree, isReviewed(tree) ? row.kind : "tree", { dbh_cm: dbh }, goesOn);
 }
 
 // Marks the tree on the card as skipped if it is open, and goes on to the next one.
@@ -334,10 +366,12 @@ async function next() {
 export function lookAt(tree) {
   draft.chosen = null;
   if (tree) select(tree.number);
-  byId("panel-annotate").scrollTop = 0;
+  showCard();
   draft.look = tree;
   news();
 }
+
+export const showCard = () => byId("review").scrollIntoView({ block: "nearest" });
 
 // The trees that the review shows after the selected one, the next one first.
 export function following() {
@@ -361,10 +395,27 @@ export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${
 
 // --- the chosen annotation -------------------------------------------------------------------------------------
 
+// There is one selection: with an annotation its tree is selected, without a tree none is.
 export function choose(id) {
+  const row = rowOf(id);
+  if (row) select(treeNumberOf(row));
   draft.chosen = id;
   draft.error = "";
+  keepOneSelection();
   news();
+}
+
+// What was chosen or said for one tree does not hold for the next one.
+let asked = null; // number of the tree
+function forgetTreeBefore() {
+  if (state.selected !== asked) Object.assign(draft, { kind: "other", refused: "" });
+  asked = state.selected;
+}
+
+// An annotation that is being moved stays chosen.
+function keepOneSelection() {
+  const row = rowOf(draft.chosen);
+  if (!row || (draft.moved?.id !== row.id && treeNumberOf(row) !== state.selected)) draft.chosen = null;
 }
 
 export function toggleAdding(wanted = !draft.adding) {
@@ -387,7 +438,8 @@ export async function settle() {
   clearTimeout(nudging);
   const moved = draft.moved;
   if (!moved) return;
-  await change(moved.row, { x: Math.round(moved.x * 1e4) / 1e4, y: Math.round(moved.y * 1e4) / 1e4 });
+  const done = await change(moved.row, { x: Math.round(moved.x * 1e4) / 1e4, y: Math.round(moved.y * 1e4) / 1e4 });
+  if (done && draft.chosen === moved.id) choose(moved.id); // it may belong to another tree now
   if (draft.moved === moved) draft.moved = null;
   news();
 }
@@ -419,7 +471,6 @@ export function startAnnotating() {
   signAs(myName());
   let run = null;
   on("annotations", () => {
-    if (rowOf(draft.chosen) === null) draft.chosen = null;
     if (state.annotations.run !== run) {
       run = state.annotations.run;
       Object.assign(draft, { moved: null, error: "", answer: null, answered: [] });
@@ -429,6 +480,8 @@ export function startAnnotating() {
     }
     news();
   });
+  on("annotations map selection", keepOneSelection);
+  on("selection", forgetTreeBefore);
   on("remapped", () => { votes = NO_VOTES; }); // numbers may belong to other trees now
   on("map tab", () => { if (annotating()) updateVotes(); });
   on("tab", () => annotating() || !draft.adding || toggleAdding(false));

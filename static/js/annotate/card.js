@@ -9,7 +9,7 @@ import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { openTab } from "../shell/tabs.js";
-import { annotating, annotationOf, draft, following, measureDbh, reviewOf, typedDbh } from "./annotations.js";
+import { annotating, annotationOf, draft, following, measureDbh, news, reviewOf, typedDbh } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
@@ -24,6 +24,7 @@ const evidence = () => byId("review-evidence");
 // a selected tree, too.
 export const card = (answers, hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
   el("div", { id: "review-evidence" }),
+  el("p", { id: "review-refused", class: "review-refused", hidden: true }),
   el("div", { class: "review-side" },
     el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" }),
       button("review-story", "Story", "Why the mapping decided so, with the figures behind it", () => openTab("story"), "quiet small")),
@@ -32,7 +33,7 @@ export const card = (answers, hint) => el("article", { id: "review", class: "rev
 
 // What else is known of the tree.
 export const moreEvidence = () => el("section", { id: "review-more", class: "review-more", "aria-label": "Further evidence on the tree" },
-  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
+  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" })),
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
@@ -103,16 +104,45 @@ const again = throttled(refresh, EVERY);
 
 // The selection may have changed when a person leaves the field: its DBH belongs to the tree that the field shows.
 function takeDbh({ target }) {
-  const tree = treeOf(Number(target.dataset.tree)), dbh = typedDbh(target.value);
-  if (tree && dbh !== undefined) measureDbh(tree, dbh);
+  const tree = treeOf(Number(target.dataset.tree)), dbh = checkedDbh(target);
+  if (tree && dbh !== undefined) measureDbh(tree, dbh, isEntered);
+}
+
+// A text that is no DBH stays in the field, and the error beside it.
+function checkedDbh(input) {
+  const dbh = typedDbh(input.value);
+  input.setAttribute("aria-invalid", String(dbh === undefined));
+  setText(byId("review-dbh-error"), dbh === undefined ? draft.error : "");
+  return dbh;
+}
+
+// Enter stores the DBH as an answer, Escape restores it; both give the keys back to the review.
+let isEntered = false;
+function endDbh(event) {
+  const { key, target } = event, tree = treeOf(Number(target.dataset.tree));
+  if (key !== "Enter" && key !== "Escape") return;
+  event.preventDefault();
+  draft.error = "";
+  if (key === "Escape") showDbh(tree);
+  else if (checkedDbh(target) === undefined) return;
+  isEntered = key === "Enter";
+  target.blur(); // calls takeDbh if the text was changed
+  isEntered = false;
+  news();
+}
+
+function showDbh(tree) {
+  const input = byId("review-dbh"), dbh = (tree && annotationOf(tree)?.dbh_cm) ?? null;
+  input.value = dbh === null ? "" : String(dbh);
+  input.setAttribute("aria-invalid", "false");
+  setText(byId("review-dbh-error"), "");
 }
 
 function fillDbh(tree) {
   const input = byId("review-dbh"), isOther = input.dataset.tree !== String(tree.number);
-  if (!isOther && input === document.activeElement) return; // a person types
-  const dbh = annotationOf(tree)?.dbh_cm ?? null;
+  if (!isOther && (input === document.activeElement || input.getAttribute("aria-invalid") === "true")) return; // a person types
   input.dataset.tree = String(tree.number);
-  input.value = dbh === null ? "" : String(dbh);
+  showDbh(tree);
   input.placeholder = tree.dbh_cm === null ? "" : `mapped ${figure(tree.dbh_cm)}`;
 }
 
@@ -133,6 +163,8 @@ export function fillCard() {
   const tree = selectedTree();
   byId("review").classList.toggle("empty-card", !tree);
   byId("review-more").hidden = !tree;
+  byId("review-refused").hidden = !tree || !draft.refused;
+  setText(byId("review-refused"), draft.refused);
   if (!tree) {
     shown = "";
     pictured = draft.shown = null;

@@ -9,7 +9,7 @@ import { throttled } from "../core/timing.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, remove, review, reviewHistory, reviewOf, rowOf, rows, sayHeld, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, moreEvidence, startCard } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -35,9 +35,9 @@ function build() {
   const asked = el("div", { id: "annotate-ask", class: "annotate-ask", hidden: Boolean(givenName()) }, el("label", {}, "Your name, stored with each answer ", nameField("annotate-asked")),
     button("annotate-nameless", "Not now", "Answers are stored under the name of this browser", () => { asked.hidden = true; }, "quiet small"));
   const answers = el("div", { class: "review-buttons", role: "group", "aria-label": "Is the selected found tree a tree?" },
-    button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree"), ""),
-    button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class beside it (N)", () => review(draft.kind), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
-    button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, ""));
+    button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", byClick(() => review("tree")), ""),
+    button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class beside it (N)", byClick(() => review(draft.kind)), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
+    button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", byClick(skip), ""));
   byId("panel-annotate").replaceChildren(
     card(answers, el("p", { id: "annotate-hint", class: "note dim", role: "status" })),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
@@ -99,8 +99,14 @@ function lineOf(row) {
   const dbh = el("input", { type: "text", inputmode: "decimal", "aria-label": `DBH of annotation ${row.id} in cm`, placeholder: "–", onchange: () => takeDbh(line, dbh) });
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete annotation ${row.id}`, onclick: (event) => { event.stopPropagation(); remove(line.row); } });
   const cells = [el("td"), el("td", {}, kind), el("td", {}, dbh), el("td"), el("td"), el("td", { class: "annotate-who" }), el("td", {}, gone)];
-  const line = { row, kind, dbh, node: el("tr", { "data-annotation": row.id, onclick: () => choose(row.id) }, ...cells) };
+  const line = { row, kind, dbh, node: el("tr", { "data-annotation": row.id, onclick: ({ target }) => openCard(row, target) }, ...cells) };
   return line;
+}
+
+// The row of an annotation opens the card of its tree; who edits in the row stays there.
+function openCard(row, target) {
+  choose(row.id);
+  if (!target.matches("input, select")) showCard();
 }
 
 function takeDbh(line, input) {
@@ -130,12 +136,12 @@ function fill() {
   if (!visible("annotate")) return;
   const problem = state.annotations?.problem || "";
   const found = trees().length, left = unreviewed();
-  const selected = selectedTree();
+  const selected = selectedTree(), chosen = rowOf(draft.chosen);
   setText(byId("annotate-count"), state.map ? `${found - left.length} of ${count(found, "tree")} reviewed` : "Nothing mapped yet");
   byId("annotate-undo").disabled = !canUndo();
   byId("annotate-redo").disabled = !canRedo();
   for (const id of ["add", "import"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !state.annotations?.run;
-  for (const id of ["yes", "no"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !selected;
+  for (const id of ["yes", "no"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !(selected ?? chosen);
   byId("annotate-next").disabled = !left.length;
   setText(byId("annotate-next"), selected && reviewOf(selected) === "open" ? "Skip (S)" : "Next (S)");
   const states = trees().map(reviewOf);
@@ -145,6 +151,7 @@ function fill() {
   setText(byId("annotate-error"), problem || draft.error);
   setText(byId("annotate-hint"), hint(selected && left.includes(selected) ? selected : null));
   fillCard();
+  byId("annotate-kind").value = draft.kind;
   byId("review-last").hidden = !answerText();
   setText(byId("review-last").firstChild, answerText());
   fillHistory();
@@ -169,6 +176,8 @@ const classOf = (tree) => annotationOf(tree)?.kind ?? "…"; // its answer is on
 
 function hint(tree) {
   if (draft.adding) return "Click on the map where a tree is missing; the ring shows where it will be added. Scores count trees near the path only (Tune, Evaluation, Reach). Esc ends.";
+  const chosen = rowOf(draft.chosen);
+  if (chosen && treeNumberOf(chosen) === null) return `Your annotation (${chosen.kind}) belongs to no found tree: Y, N and the keys of the classes set its class, arrows move it, Del deletes it.`;
   if (imported) return imported;
   if (tree) return `Tree ${tree.number}, ${seenText(tree)}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?`;
   if (!rows().length) return "Press Next to review the trees one by one, or Add and click on the map where a tree was missed (Shift+click in the 3D scene).";
@@ -226,7 +235,7 @@ export function annotateKey(event) {
 // A key that is held down repeats itself about 30 times per second: it neither answers nor switches again.
 function isHeld({ key, shiftKey }) {
   const answers = ["y", "n", "s"].includes(key) || (shiftKey && key in CLASS_KEYS);
-  if (answers) sayHeld();
+  if (answers) refuseHeld();
   return answers || key === "a" || key === "r";
 }
 

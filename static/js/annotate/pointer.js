@@ -6,10 +6,10 @@ import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { clusters, trees } from "../core/store.js";
 import { colours } from "../core/theme.js";
-import { drawCircle, drawText } from "../map/draw.js";
+import { drawCircle, drawText, treeAt } from "../map/draw.js";
 import { onSceneLoad } from "../scene/scene.js";
 import { viewOf } from "../scene/viser_client.js";
-import { add, annotating, choose, draft, news, rowOf, rows, settle } from "./annotations.js";
+import { add, annotating, choose, draft, news, rowOf, rows, settle, showCard, treeNumberOf } from "./annotations.js";
 
 const SNAP = 0.7; // [m]
 const REACH = 11; // [px] around an annotation
@@ -21,6 +21,13 @@ const rowAt = ([px, py], view) => nearest(rows(), (row) => {
   return Math.hypot(px - x, py - y);
 }, REACH);
 
+// Whether the pointer is nearer to a tree to which the annotation does not belong.
+function isBehindTree(row, [px, py], view) {
+  const tree = treeAt(trees(), [px, py], view), pointer = { x: px, y: py };
+  const gap = ({ x, y }) => { const [sx, sy] = view.toScreen(x, y); return distance(pointer, { x: sx, y: sy }); };
+  return Boolean(tree) && treeNumberOf(row) !== tree.number && gap(tree) < gap(placeOf(row));
+}
+
 // {x, y, on}: the centre of the nearest tree or cluster within SNAP, else the place itself [m].
 function snap(x, y) {
   const places = [...clusters().map((cluster) => ({ ...cluster, on: "cluster" })), ...trees().map((tree) => ({ x: tree.x, y: tree.y, on: `tree ${tree.number}` }))];
@@ -31,7 +38,7 @@ function snap(x, y) {
 
 export function grab(at, view) {
   const row = annotating() && !draft.adding ? rowAt(at, view) : null;
-  if (!row) return false;
+  if (!row || isBehindTree(row, at, view)) return false;
   settle();
   choose(row.id);
   draft.held = row;
@@ -52,6 +59,7 @@ export function drop() {
   if (!draft.held) return false;
   draft.held = null;
   settle();
+  if (draft.chosen !== null) showCard();
   return true;
 }
 
@@ -69,6 +77,7 @@ export function clickAt(at, view, tree) {
   } else {
     choose(null);
     select(tree ? tree.number : null);
+    if (tree) showCard();
   }
   return true;
 }
@@ -83,7 +92,7 @@ export function drawAnnotations(pen, view) {
     pen.stroke();
   }
   const chosen = rowOf(draft.chosen);
-  if (chosen) {
+  if (chosen && treeNumberOf(chosen) === null) { // else the ring is that of its tree
     Object.assign(pen, { strokeStyle: colours.selection, lineWidth: 3 });
     drawCircle(pen, ...view.toScreen(placeOf(chosen).x, placeOf(chosen).y), 10);
     pen.stroke();
