@@ -494,9 +494,9 @@ class Mapper:
     ) -> tuple[PoseEstimate, tuple[str, ...]]:
         """Update the faults of the run. Return the estimate, whose pose quality is not good while a fault
         lasts, and the messages about new faults."""
-        is_empty = (
-            self._parameters.ground.method != "none" and len(step.scan.points) > 0 and not len(scan.raw)
-        )
+        # By the counts, since a scan that was segmented before has no points.
+        returns, lost = scan.counts.get("returns", 0), scan.counts.get("out of range", 0)
+        is_empty = self._parameters.ground.method != "none" and 0 < returns == lost
         no_ground = NO_GROUND in scan.warnings
         reasons = reasons_of(estimate.health, is_ground_missing=no_ground, is_empty=is_empty)
         self._faults, messages = self._faults.after_scan(step.scan.stamp_ns, reasons)

@@ -16,15 +16,17 @@ from pipeline.config.model import Value
 from pipeline.errors import StemmapError
 from pipeline.front_end import SegmentedScan
 from pipeline.io.checkpoints import encode
+from pipeline.map_faults import EMPTY
 from pipeline.remapping.rerun import (
     SEGMENTATION_CLASSIFICATION,
     SEGMENTATION_STAGES,
     Rerun,
+    ScanCache,
     ScanCaches,
     segmentation_key,
 )
 from pipeline.types.records import Frame, Step
-from tests.pipeline.remapping.mapped import BASE, frames, mapper, run
+from tests.pipeline.remapping.mapped import BASE, fill, frames, mapper, run
 
 SETS = 6
 WIDER = BASE.replace({"clustering.eps": 0.3, "ground.height_max": 2.5})
@@ -143,3 +145,16 @@ def test_segment_ahead_keeps_the_order_stops_when_asked_and_raises_errors_in_tur
     with pytest.raises(StemmapError, match="this scan fails"):
         next(given)
     assert len(read) <= 4 + AHEAD
+
+
+def test_scans_without_their_points_make_no_map_doubtful():
+    """A seek maps whole steps with cached scans, which have no points."""
+    parts = run()[0]
+    one, other = mapper(BASE), mapper(BASE)
+    with closing(fill(ScanCache(), BASE, parts)) as cache:
+        for step in parts:
+            cached = cache.read(step.index, step.scan.stamp_ns)
+            assert cached is not None
+            frame = one.process(step, cached[1])
+            assert content(frame) == content(other.process(step)), step.index
+            assert not any(EMPTY in text for text in frame.warnings)
