@@ -79,7 +79,7 @@ class ShownMap:
                 traceback.print_exc(file=sys.stderr)
             problems = (fault,) * len(self.repairs)
             numbers = ((),) * len(problems)
-            found = RepairedMap(shown.frame, shown.path, problems, numbers, loops_of(graph), None)
+            found = RepairedMap(shown.frame, shown.path, problems, numbers, numbers, loops_of(graph), None)
         self._repaired = (shown.frame, hurried, found)
         return found
 

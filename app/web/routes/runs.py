@@ -23,6 +23,7 @@ from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.shown_run import ShownRun
 from app.sources import opening
+from app.sources.live_address import is_live
 from app.sources.request import request_of_kept
 from app.store.records import UnknownError
 from app.store.store import RunRecords
@@ -43,6 +44,7 @@ from app.web.routes.access import (
     permitted_request,
 )
 from pipeline.config import PRESETS, preset
+from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api/runs")
 
@@ -117,8 +119,13 @@ async def restore(number: Number, dashboard: Dash) -> Response:
 async def replay(key: Key, dashboard: Dash, settings: Deployment, permitted: Permitted) -> Response:
     """Open the source of a run again, with its topics, mounting and final parameters. The response is empty
     (202); the status reports the result. 403 if the file may not be opened by the caller, 404 for an unknown
-    run, 409 if its source cannot be opened, 422 if its parameters are not valid in this version."""
+    run, 409 if it was live or its source cannot be opened, 422 if its parameters are not valid in this
+    version."""
     run = await whole_run(key, settings, dashboard)
+    if is_live(run["uri"]):  # its address would end the open run, and map what the robot sends now
+        raise StemmapError(
+            "a live run cannot be replayed", where=run["name"], remedy="Open its recording, if one was made"
+        )
     request = request_of_kept(
         run["uri"],
         odometry=run.get("odometry") or "auto",

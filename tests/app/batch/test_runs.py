@@ -181,6 +181,20 @@ async def test_a_run_is_played_again_with_its_parameters(both: Running) -> None:
     assert (dashboard.parameters.preset, begun.play) == ("forest", True)
 
 
+async def test_a_live_run_is_not_replayed_and_the_open_run_goes_on(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard, "zenoh:tcp/127.0.0.1:7447")
+    await play(dashboard, "other:", run=2)
+    worker = dashboard.worker
+    assert isinstance(worker, FakeWorker)
+    before = list(worker.commands)
+    key = next(row["key"] for row in await runs(client) if row["uri"].startswith("zenoh:"))
+    answer = await client.post(f"/api/runs/{key}/replay")
+    assert answer.status_code == 409
+    assert "recording" in answer.text
+    assert worker.commands == before
+
+
 async def test_a_run_is_played_again_with_its_topics_and_mounting(both: Running) -> None:
     client, dashboard = both
     chosen = Open("fake:", topics={"scan": "/other"}, mount=(0.0, 0.1, 2.0, 0.0, 0.0, 0.5))
