@@ -371,7 +371,11 @@ export function lookAt(tree) {
   news();
 }
 
-export const showCard = () => byId("review").scrollIntoView({ block: "nearest" });
+// Brings title and pictures of the card into view; the title also where both do not fit.
+export function showCard() {
+  byId("panel-annotate").scrollTop = 0;
+  for (const id of ["review-evidence", "review-title"]) byId(id).scrollIntoView({ block: "nearest" });
+}
 
 // The trees that the review shows after the selected one, the next one first.
 export function following() {
@@ -482,6 +486,7 @@ export function startAnnotating() {
   });
   on("annotations map selection", keepOneSelection);
   on("selection", forgetTreeBefore);
+  on("tab", () => annotating() && showCard());
   on("remapped", () => { votes = NO_VOTES; }); // numbers may belong to other trees now
   on("map tab", () => { if (annotating()) updateVotes(); });
   on("tab", () => annotating() || !draft.adding || toggleAdding(false));
