@@ -536,6 +536,7 @@ def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str)
         robot="a",
         robots=["a"],
         recording="",
+        recorded_file="",
     )
     told = with_robot(Status(state="playing", source="zenoh:"), cast(Any, robot))
     assert (told.state, told.detail) == (state, "" if waiting else "Nothing heard for 3 s")
