@@ -113,6 +113,7 @@ function checkedDbh(input) {
   const dbh = typedDbh(input.value);
   input.setAttribute("aria-invalid", String(dbh === undefined));
   setText(byId("review-dbh-error"), dbh === undefined ? draft.error : "");
+  if (dbh === undefined) byId("review-dbh-error").scrollIntoView({ block: "nearest" });
   return dbh;
 }
 
