@@ -44,7 +44,6 @@ if TYPE_CHECKING:
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 _SCENE_PAUSE_S = 0.09
-#: The status of a recorder, see `Recorder.status`, with the name of its file.
 
 
 class Dashboard:

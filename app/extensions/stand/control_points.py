@@ -53,7 +53,8 @@ def fit_control_points(
         known: The same points in the reference system: east, north, shape (N, 2) [m].
         names: Names of the points, for messages; by default their numbers.
         point_sigma: Expected standard deviation of a coordinate [m]. A fit whose `sigma_point` is more than
-            CONTRADICTION times this is refused, and one of whose points the others exclude.
+            CONTRADICTION times this is refused; so are four or more points of which the fit of the others
+            excludes one.
 
     Raises:
         StemmapError: There are fewer than two points, they are at one position in either frame (RMS distance
@@ -73,9 +74,8 @@ def fit_control_points(
         )
     fit = fit_rigid_pairs(local, known)
     allowed = CONTRADICTION * point_sigma
-    rest = [
-        fit_rigid_pairs(np.delete(local, k, axis=0), np.delete(known, k, axis=0)) for k in range(n) if n > 2
-    ]
+    every = range(n if n > 2 else 0)  # one point has no fit
+    rest = [fit_rigid_pairs(np.delete(local, k, axis=0), np.delete(known, k, axis=0)) for k in every]
     if fit.sigma_point <= allowed and not _has_outlier(local, known, rest, point_sigma):
         return fit
     if fit_rigid_pairs(a, b[:, ::-1]).sigma_point <= min(allowed, 0.2 * fit.sigma_point) and n > 2:

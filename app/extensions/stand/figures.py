@@ -20,9 +20,9 @@ INCH_10 = 25.4  # cm
 # Share of the value below which the known parts of an error say nothing: the trees that the map lacks, which
 # are not among them, are then the larger part.
 NEGLIGIBLE = 0.001
-# Standard errors by which the trees that were found may exceed those that the observed part lets expect: more
-# happens in one of 700 plots whose parts are alike.
-BEYOND = 3.0
+# Probability of as many trees outside of the observed part, if the parts are alike, below which they are not:
+# three standard deviations of a normal distribution, one-sided.
+UNLIKE = 0.00135
 
 
 class Estimate(NamedTuple):
@@ -203,12 +203,10 @@ def stand_figures(
             fit = 0.0 if assumed else total * p_se / p
             spread = math.sqrt((1.0 - share * p) * squares + variance + fit**2)
             values[f"{name}_corrected"] = _scaled(HECTARE / (seen * p), total, spread, assumed)
-    n_ha = values["n_ha"]
-    expected, error = n_ha.value * area / HECTARE, n_ha.se * area / HECTARE
-    if len(every) > expected + BEYOND * error:  # the whole plot has at least the trees that were found in it
+    if _is_unlike(n, len(every) - n, share):
         warnings.append(
-            f"{len(every)} trees were found in the plot, while its observed part lets expect {expected:.0f}: "
-            "it is not like the rest, and the errors of stems, basal area and volume are not known"
+            f"the plot has {len(every)} trees, but its observed part leads to {n / share:.0f}: it is not "
+            "like the rest, and the errors of stems, basal area and volume are not known"
         )
         for name, _, _ in totals:
             for each in (name, f"{name}_corrected"):
@@ -218,6 +216,17 @@ def stand_figures(
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _classes(kept, share, seen, parameters, math.isnan(p_se))
     return StandFigures(area, seen, n, missing, volumes, Estimate(p, p_se), values, classes, tuple(warnings))
+
+
+def _is_unlike(inside: int, outside: int, share: float) -> bool:
+    """Return whether more trees were found outside of the observed share of a plot than chance explains.
+
+    Trees that stand at random are in either part in proportion to its area (binomial distribution). Those
+    outside that were not found would only add to them.
+    """
+    from scipy.stats import binom
+
+    return share < 1.0 and bool(binom.sf(outside - 1, inside + outside, 1.0 - share) < UNLIKE)
 
 
 def _scaled(scale: float, total: float, se: float, assumed: bool) -> Estimate:

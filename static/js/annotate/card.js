@@ -108,7 +108,7 @@ function takeDbh({ target }) {
   if (tree && dbh !== undefined) measureDbh(tree, dbh, isEntered);
 }
 
-// A text that is no DBH stays in the field, and the error beside it.
+// A text that cannot be read as a DBH stays in the field, with the error beside it.
 function checkedDbh(input) {
   const dbh = typedDbh(input.value);
   input.setAttribute("aria-invalid", String(dbh === undefined));

@@ -36,7 +36,7 @@ function build() {
     button("annotate-nameless", "Not now", "Answers are stored under the name of this browser", () => { asked.hidden = true; }, "quiet small"));
   const answers = el("div", { class: "review-buttons", role: "group", "aria-label": "Is the selected found tree a tree?" },
     button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", byClick(() => review("tree")), ""),
-    button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class beside it (N)", byClick(() => review(draft.kind)), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
+    button("annotate-no", "No (N)", "The selected object is not a tree; the class beside it is stored (N)", byClick(() => review(draft.kind)), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
     button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, ""));
   byId("panel-annotate").replaceChildren(
     card(answers, el("p", { id: "annotate-hint", class: "note dim", role: "status" })),

