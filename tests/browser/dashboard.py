@@ -123,7 +123,8 @@ class Dashboard:
     # --- the run ---------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Show the default run again, without annotations, a loop or another speed, and with the preset."""
+        """Show the default run again, without annotations, a selection, a loop or another speed, and with
+        the preset."""
         self.open(RUN)
         self.pause()
         self.page.evaluate(RESET)
@@ -337,6 +338,7 @@ RESET = """async () => {
     headers: { "Content-Type": "application/json" } });
   await send("POST", "/api/loop", { from_s: null, to_s: null });
   await send("POST", "/api/command", { type: "set_speed", factor: 1 });
+  (await import("/static/js/core/live_feed.js")).select(null);
   const { run, trees, skipped, others } = await (await fetch("/api/annotations")).json();
   for (const { id, version } of [...trees, ...skipped, ...(others.repair ?? [])])
     await send("DELETE", `/api/annotations/${id}`, { run, version, browser: "c".repeat(32), who: "reset" });
