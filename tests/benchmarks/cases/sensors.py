@@ -31,7 +31,7 @@ def run() -> list[Table]:
     for name in LIDAR_NAMES:
         scores, on = list["MapScores"](), Counter[str]()
         for seed in chosen_seeds(SEEDS):
-            row, score, false = mapped(f"sim:wild?seed={seed}&duration=20&lidar={name}", seed)
+            row, score, false, _ = mapped(f"sim:wild?seed={seed}&duration=20&lidar={name}", seed)
             scores.append(score)
             on += false
             print(name, *row, dict(false), file=sys.stderr, flush=True)
