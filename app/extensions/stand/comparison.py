@@ -206,6 +206,13 @@ def _other_unit(a: VisitTrees, b: VisitTrees) -> str:
     return f". The median diameters are {100 * first:.1f} and {100 * second:.1f} cm: check their units"
 
 
+def _shared_sigma(trees: VisitTrees) -> float:
+    """Return the standard deviation of the mean of the diameters by the error that they share [m]; 0 for a
+    table without standard deviations, such as those by tape."""
+    sigma = trees.dbh_sigma[np.isfinite(trees.dbh)]
+    return float(np.minimum(np.nan_to_num(sigma), Stand().dbh_shared_sigma).mean()) if len(sigma) else 0.0
+
+
 def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
     """Return a dict with the keys COLUMNS for each tree, with None for unknown values: first for the trees of
     a in their order, each with its pair in b, then for the unpaired trees of b. Positions are in the frame of
@@ -298,7 +305,8 @@ def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, A
     (`x_m`, `y_m`, `turn_deg`), `shift_of_centre_m` ([x, y] of the mean position of the trees of b) and
     `stems`; the numbers of trees `trees_a` and `trees_b`; `counts`, a dict from each status to its number of
     rows; `pairs`, the number of pairs, and `shift_rms_m`; `with_dbh`, the number of pairs with a DBH in both
-    visits, and of these `growth_mean_cm`, `growth_weighted_cm`, `growth_se_cm` (at least two pairs),
+    visits, and of these `growth_mean_cm`, `growth_weighted_cm`, `growth_se_cm` (at least two pairs, with the
+    error that the diameters of a visit share, which is taken as independent of that of the other visit),
     `dbh_rms_difference_cm` and the number `significant`; and `warnings`, a list of strings.
     """
     rows = rows_of(a, b, found)
@@ -324,7 +332,8 @@ def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, A
         "shift_rms_m": float(np.sqrt(np.mean(np.square(found.shift)))) if len(found.shift) else None,
         "growth_mean_cm": 100.0 * float(growth.mean()) if known else None,
         "growth_weighted_cm": 100.0 * float(weight @ growth / weight.sum()) if known else None,
-        "growth_se_cm": 100.0 * float(growth.std(ddof=1) / math.sqrt(len(growth)))
+        "growth_se_cm": 100.0
+        * math.hypot(growth.std(ddof=1) / math.sqrt(len(growth)), *(_shared_sigma(v.trees) for v in (a, b)))
         if len(growth) > 1
         else None,
         "dbh_rms_difference_cm": 100.0 * float(np.sqrt(np.mean(np.square(growth)))) if known else None,

@@ -23,6 +23,7 @@ NEGLIGIBLE = 0.001
 # Probability of as many trees outside of the observed part, if the parts are alike, below which they are not:
 # three standard deviations of a normal distribution, one-sided.
 UNLIKE = 0.00135
+FAR = 40.0  # standard deviations, beyond which a normal distribution is 0 or 1 in double precision
 
 
 class Estimate(NamedTuple):
@@ -51,6 +52,7 @@ class PlotTrees:
         dbh, dbh_sigma: Diameters at breast height and their standard deviations [m]; NaN where unknown.
         volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None if there is no volume
             formula.
+        volume_shared: Part of `volume_sigma` by the error that all diameters share [m^3], or None.
     """
 
     position: Float
@@ -58,11 +60,13 @@ class PlotTrees:
     dbh_sigma: Float
     volume: Float | None = None
     volume_sigma: Float | None = None
+    volume_shared: Float | None = None
 
     def where(self, keep: Bool) -> PlotTrees:
         """Return the rows for which `keep`, shape (T,), is true."""
-        volume, sigma = (None if c is None else c[keep] for c in (self.volume, self.volume_sigma))
-        return PlotTrees(self.position[keep], self.dbh[keep], self.dbh_sigma[keep], volume, sigma)
+        volumes = (self.volume, self.volume_sigma, self.volume_shared)
+        kept = (None if column is None else column[keep] for column in volumes)
+        return PlotTrees(self.position[keep], self.dbh[keep], self.dbh_sigma[keep], *kept)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,9 +132,10 @@ def stand_figures(
     """Return the stand parameters of a plot.
 
     Standard errors are those of this plot, not of the stand around it: they contain the errors of the
-    diameters, the trees of the part that was not observed, and, of corrected parameters, the trees that were
-    not detected. A plot that is observed completely, with certain detection and exact diameters of all trees,
-    has standard errors of 0, except for the parameters of the spatial pattern.
+    diameters, of which all trees share a part (`Stand.dbh_shared_sigma`), the trees of the part that was not
+    observed, and, of corrected parameters, the trees that were not detected. A plot that is observed
+    completely, with certain detection and exact diameters of all trees, has standard errors of 0, except for
+    the parameters of the spatial pattern.
 
     Args:
         trees: Trees in the observed part, of any diameter.
@@ -181,19 +186,21 @@ def stand_figures(
     if seen <= 0.0:
         return StandFigures(area, 0.0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
     every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
-    plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))))
+    plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))), 0.0)
     values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)
     values["g_ha_plain"] = Estimate(HECTARE * float(plain.sum()) / area)
     share = min(seen / area, 1.0)
-    basal, basal_var = _basal_areas(kept)
-    unsure = _threshold_variance(trees, parameters.dbh_min)
+    common = parameters.dbh_shared_sigma
+    basal, basal_var = _basal_areas(kept, common)
+    unsure = _threshold_variance(trees, parameters.dbh_min, common)
     totals = [
         ("n_ha", np.ones(n), unsure),
-        ("g_ha", basal, float(basal_var.sum()) + unsure * _least_basal(parameters) ** 2),
+        ("g_ha", basal, basal_var + unsure * _least_basal(parameters) ** 2),
     ]
     if kept.volume is not None and kept.volume_sigma is not None and (volumes or not n):
-        variance = float(np.square(np.nan_to_num(kept.volume_sigma)).sum())
-        totals.append(("v_ha", np.nan_to_num(kept.volume), variance))
+        sigma = np.nan_to_num(kept.volume_sigma)
+        shared = np.zeros(n) if kept.volume_shared is None else np.minimum(kept.volume_shared, sigma)
+        totals.append(("v_ha", np.nan_to_num(kept.volume), _variance_of_sum(sigma, shared)))
     for name, weights, variance in totals:
         total, squares = float(weights.sum()), float(np.square(weights).sum())
         se = math.sqrt((1.0 - share) * squares + variance)
@@ -262,29 +269,46 @@ def _least_basal(parameters: Stand) -> float:
     return 0.25 * math.pi * parameters.dbh_min**2
 
 
-def _basal_areas(trees: PlotTrees) -> tuple[Float, Float]:
-    """Return the basal area of each tree [m^2] and its variance [m^4], shape (T,) each. A tree without a
-    diameter has the mean, and the variance among the others (of a single one its square); all are NaN if no
-    tree has a diameter. An unknown standard deviation of a diameter counts as 0."""
+def _variance_of_sum(sigma: Float, shared: Float) -> float:
+    """Return the variance of the sum of values with standard deviations `sigma`, shape (T,), of which the
+    parts `shared`, at most `sigma`, are one error of all."""
+    return float(np.square(sigma).sum() - np.square(shared).sum() + shared.sum() ** 2)
+
+
+def _basal_areas(trees: PlotTrees, common: float) -> tuple[Float, float]:
+    """Return the basal area of each tree, shape (T,) [m^2], and the variance of their sum [m^4], with the
+    error `common` of all diameters [m]. A tree without a diameter has the mean, with the variance among the
+    others (of a single one its square); both are NaN if no tree has a diameter. An unknown standard deviation
+    of a diameter counts as 0."""
     d, sigma = trees.dbh, np.nan_to_num(trees.dbh_sigma)
     known = np.isfinite(d)
+    if not len(d):
+        return np.zeros(0), 0.0
+    if not known.any():
+        return np.full(len(d), math.nan), math.nan
     basal = 0.25 * math.pi * np.square(d)
-    variance = np.square(0.5 * math.pi * d * sigma)
-    if not known.all():
-        mean = float(basal[known].mean()) if known.any() else math.nan
-        spread = float(basal[known].var(ddof=1)) if known.sum() > 1 else mean**2
-        basal, variance = np.where(known, basal, mean), np.where(known, variance, spread)
-    return basal, variance
+    by_dbh = 0.5 * math.pi * d
+    error, shared = by_dbh * sigma, by_dbh * np.minimum(sigma, common)
+    mean, missing = float(basal[known].mean()), int(np.count_nonzero(~known))
+    spread = float(basal[known].var(ddof=1)) if known.sum() > 1 else mean**2
+    # The mean that a tree without a diameter has contains the shared error, too.
+    of_all = np.where(known, shared, float(shared[known].mean()))
+    own = float((np.square(error) - np.square(shared))[known].sum()) + missing * spread
+    return np.where(known, basal, mean), own + float(of_all.sum()) ** 2
 
 
-def _threshold_variance(trees: PlotTrees, least: float) -> float:
-    """Return the variance of the number of trees above the diameter `least` [m] by the errors of diameters;
-    trees without a diameter or its standard deviation add nothing."""
-    from scipy.special import ndtr
+def _threshold_variance(trees: PlotTrees, least: float, common: float) -> float:
+    """Return the variance of the number of trees above the diameter `least` [m] by the errors of diameters,
+    of which `common` [m] is shared; trees without a diameter or its standard deviation add nothing."""
+    from scipy.stats import norm
 
-    sigma = np.where(trees.dbh_sigma > 0.0, trees.dbh_sigma, np.nan)
-    p = ndtr((trees.dbh - least) / sigma)
-    return float(np.nansum(p * (1.0 - p)))
+    known = np.isfinite(trees.dbh) & (trees.dbh_sigma > 0.0)
+    sigma = trees.dbh_sigma[known]
+    above = np.clip((trees.dbh[known] - least) / sigma, -FAR, FAR)
+    p = norm.cdf(above)
+    # Change of the expected number by the shared error.
+    shared = norm.pdf(above) * np.minimum(sigma, common) / sigma
+    return _variance_of_sum(np.sqrt(p * (1.0 - p)), shared)
 
 
 def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: Stand) -> dict[str, Estimate]:
@@ -295,6 +319,7 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
     d, sigma = 100.0 * trees.dbh[known], 100.0 * np.nan_to_num(trees.dbh_sigma[known])
     if not len(d):
         return {}
+    shared = np.minimum(sigma, 100.0 * parameters.dbh_shared_sigma)
     thickest = min(parameters.dominant_per_ha * seen / HECTARE, float(len(d)))
     stems = HECTARE * len(trees.dbh) / seen
 
@@ -319,11 +344,11 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
         return figure, REINEKE * figure / dg * slope
 
     figures = {"dg_cm": quadratic, "mean_dbh_cm": mean, "dominant_dbh_cm": dominant, "sdi": density}
-    return {name: _with_error(figure, d, sigma, found) for name, figure in figures.items()}
+    return {name: _with_error(figure, d, sigma, shared, found) for name, figure in figures.items()}
 
 
 def _with_error(
-    figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, found: float
+    figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, shared: Float, found: float
 ) -> Estimate:
     """Return a stand parameter with its standard error, which is NaN for a single tree of an incomplete plot.
 
@@ -331,11 +356,12 @@ def _with_error(
         figure: Function of the diameters, shape (N,) [cm], that returns the stand parameter and its
             derivatives with respect to the diameters, shape (N,).
         d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
+        shared: Part of `sigma` that is one error of all diameters, shape (N,) [cm].
         found: Share of all trees that was found and observed.
     """
     n = len(d)
     value, slope = figure(d)
-    measured = float(np.square(slope * sigma).sum())
+    measured = _variance_of_sum(slope * sigma, slope * shared)
     sampled = 0.0
     if n > 1 and found < 1.0:
         without = np.array([figure(np.delete(d, k))[0] for k in range(n)])
@@ -392,9 +418,9 @@ def _classes(
     scale, rest = HECTARE / seen, 1.0 - share
     rows = []
     for k in range(first, int(of.max()) + 1):
-        basal, variance = _basal_areas(known.where(of == k))
+        basal, variance = _basal_areas(known.where(of == k), parameters.dbh_shared_sigma)
         n = len(basal)
-        g_se = math.sqrt(rest * float(np.square(basal).sum()) + float(variance.sum()))
+        g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance)
         rows.append(
             DiameterClass(
                 round(100.0 * max(k * width, parameters.dbh_min), 6),

@@ -16,6 +16,9 @@ class Stand(Stage):
     dbh_min: float = number(0.07, "Minimum diameter", "m", 0.0, 1.0, 0.01)
     """Thinner trees do not count."""
 
+    dbh_shared_sigma: float = number(0.005, "Shared DBH sigma", "m", 0.0, 0.05, 0.001)
+    """Part of the standard deviation of a diameter that is one error of all trees of a map."""
+
     class_width: float = number(0.04, "Class width", "m", 0.005, 0.5, 0.005)
     """Width of the diameter classes."""
 

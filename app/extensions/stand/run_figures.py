@@ -103,7 +103,7 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise StemmapError(f"two plots are called {twice!r}", remedy="Give each plot its own name")
-    trees = _plot_trees(run.trees, parameters.volume)
+    trees = _plot_trees(run.trees, parameters)
     chosen = list(plots) or [seen_plot(ALL, seen)]
     figures = figures_of(chosen, trees, seen, parameters)
     observed = [f for f in figures.values() if f.seen > 0.0]
@@ -164,16 +164,19 @@ def _left_out(
     return result
 
 
-def _plot_trees(trees: Trees, formula: str) -> PlotTrees:
+def _plot_trees(trees: Trees, parameters: Stand) -> PlotTrees:
     """Return trees for stand figures, with volumes by a formula if it is not empty; raises StemmapError if it
     is not valid."""
-    if not formula:
+    if not parameters.volume:
         return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma)
     unknown = np.full(len(trees.number), np.nan)
     height = unknown if trees.height is None else trees.height
     sigma = unknown if trees.height_sigma is None else trees.height_sigma
-    volume = VolumeFormula.parse(formula).with_sigma(trees.dbh, trees.dbh_sigma, height, sigma)
-    return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, *volume)
+    formula = VolumeFormula.parse(parameters.volume)
+    volume = formula.with_sigma(trees.dbh, trees.dbh_sigma, height, sigma)
+    shared = np.minimum(np.nan_to_num(trees.dbh_sigma), parameters.dbh_shared_sigma)
+    _, volume_shared = formula.with_sigma(trees.dbh, shared, height, unknown)
+    return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, *volume, volume_shared)
 
 
 def extent_words(points: np.ndarray) -> str:

@@ -94,6 +94,10 @@ def test_the_map_and_the_files_show_every_tree(visits, tmp_path, capsys):
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert record["pairs"] == 59
     assert sum(record["counts"].values()) == 61
+    # The 0.4 cm of each visit are an error that its diameters may share.
+    growth = [float(row["growth_cm"]) for row in rows(tmp_path / "out") if row["growth_cm"]]
+    own = np.std(growth, ddof=1) / math.sqrt(len(growth))
+    assert record["growth_se_cm"] == pytest.approx(math.hypot(own, 0.4, 0.4), abs=0.01)
 
 
 def test_a_tree_rejected_in_one_visit_is_neither_missing_nor_new(visits, tmp_path, capsys):

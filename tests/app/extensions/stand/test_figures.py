@@ -15,6 +15,9 @@ from app.extensions.stand.figures import PlotTrees, combined, stand_figures
 from app.extensions.stand.parameters import Stand
 
 
+INDEPENDENT = Stand(dbh_shared_sigma=0.0)
+
+
 def trees_of(dbh, sigma=0.0, position=None):
     """Trees in a row, 2 m apart, unless positions are given."""
     dbh = np.array(dbh, np.float64)
@@ -60,7 +63,7 @@ def test_stems_of_25_4_cm_have_their_number_as_density_index():
 
 def test_errors_of_diameters_reach_the_figures_as_by_propagation():
     d, sigma = np.array([0.15, 0.25, 0.35] * 4), 0.01
-    v = figures(trees_of(d, sigma)).values
+    v = figures(trees_of(d, sigma), limits=INDEPENDENT).values
     assert v["g_ha"].se == pytest.approx(10.0 * math.sqrt(np.square(math.pi / 2 * d * sigma).sum()), rel=1e-4)
     assert v["mean_dbh_cm"].se == pytest.approx(1.0 / math.sqrt(12), rel=1e-3)
     dg = math.sqrt(np.square(d).mean())
@@ -68,8 +71,44 @@ def test_errors_of_diameters_reach_the_figures_as_by_propagation():
     assert v["n_ha"].se == pytest.approx(0.0, abs=1e-5)
 
 
+def test_an_error_that_all_diameters_share_does_not_shrink_with_their_number():
+    """Diameters drawn with their own and a shared error: the errors agree with the spread of the figures."""
+    random = np.random.default_rng(4)
+    true, shared, own = random.uniform(0.15, 0.45, 60), 0.006, 0.012
+    names = ("g_ha", "v_ha", "dg_cm", "mean_dbh_cm", "sdi")
+    found, told = [], []
+    for _ in range(400):
+        d = true + random.normal(0.0, shared) + random.normal(0.0, own, 60)
+        volume = {
+            "volume": 10.0 * np.square(d),
+            "volume_sigma": 20.0 * d * math.hypot(own, shared),
+            "volume_shared": 20.0 * d * shared,
+        }
+        trees = replace(trees_of(d, math.hypot(own, shared)), **volume)
+        v = figures(trees, limits=Stand(dbh_shared_sigma=shared)).values
+        found.append([v[name].value for name in names])
+        told.append([v[name].se for name in names])
+    ratio = np.std(found, axis=0) / np.sqrt(np.mean(np.square(told), axis=0))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.12)
+    many = figures(trees_of([0.3] * 400, 0.01), limits=Stand(dbh_shared_sigma=0.006)).values["mean_dbh_cm"]
+    assert many.se == pytest.approx(math.sqrt(0.6**2 + (1.0 - 0.6**2) / 400))
+
+
+def test_a_shared_error_moves_all_trees_across_the_minimum_diameter_together():
+    random = np.random.default_rng(5)
+    true, shared, own = random.uniform(0.05, 0.15, 300), 0.006, 0.008
+    found, told = [], []
+    for _ in range(400):
+        d = true + random.normal(0.0, shared) + random.normal(0.0, own, 300)
+        limits = Stand(dbh_shared_sigma=shared, dbh_min=0.1)
+        n = figures(trees_of(d, math.hypot(own, shared)), limits=limits).values["n_ha"]
+        found.append(n.value)
+        told.append(n.se)
+    assert np.std(found) == pytest.approx(np.sqrt(np.mean(np.square(told))), rel=0.15)
+
+
 def test_equal_diameters_do_not_inflate_the_error_of_the_dominant_one():
-    dominant = figures(trees_of([0.2] * 40, 0.01)).values["dominant_dbh_cm"]
+    dominant = figures(trees_of([0.2] * 40, 0.01), limits=INDEPENDENT).values["dominant_dbh_cm"]
     assert dominant == pytest.approx((20.0, 1.0 / math.sqrt(10)))
 
 
