@@ -379,7 +379,8 @@ class Tracking(Stage):
     """Height above the ground of the reported diameter."""
 
     out_of_round: float = number(0.025, "Out-of-roundness", "", 0.0, 0.2, 0.005)
-    """Lower bound of the DBH sigma as a fraction of the diameter, since stems are not circular."""
+    """Standard deviation of the diameters of a stem in all directions as a fraction of its DBH. It decides
+    the DBH sigma of stems that were seen from one side."""
 
     taper_sigma: float = number(0.02, "Taper sigma", "m/m", 0.0, 0.1, 0.005)
     """Standard deviation of the taper: change of the diameter per metre of height."""

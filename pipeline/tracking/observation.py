@@ -25,6 +25,11 @@ HALF = 0.5  # m; distance from breast height at which a radius has half the weig
 # Errors of a radius that more scans do not reduce: each edge of a trunk is known to a fifth of half the width
 # of a beam, or of half the distance between returns if that is larger; bark is uneven [m].
 EDGE, UNEVEN = 0.2, 0.0005
+#: A circle fitted by least squares to ONE_VIEW [rad] of a stem of radius r (1 + a cos 2 (angle - b)) has a
+#: radius that is wrong by RADIUS_GAIN a r cos 2 b, and over all b the RMS error of each coordinate of its
+#: centre is CENTRE_GAIN times that of a r cos 2 b. Views from all sides cancel both: the radius like the
+#: second harmonic of their direction, the centre mainly like the first one, since it turns with the view.
+ONE_VIEW, RADIUS_GAIN, CENTRE_GAIN = np.radians(140.0), 2.0, 2.3
 #: Least diameter of a trunk, in distances between returns: a sampled shape is resolved from two samples on
 #: (Nyquist). What returns measure of thinner trunks depends on the prior and on the undergrowth.
 RESOLVED = 2.0
@@ -127,7 +132,8 @@ class FigureLimits(NamedTuple):
         hits_to_confirm: Minimum number of detections of a tree without a class of a voxel column.
         dbh_arc_min: Minimum observed arc for a diameter [rad].
         dbh_sigma_max: Maximum standard deviation of a diameter [m].
-        out_of_round: Lower bound of the DBH sigma, as a fraction of the DBH.
+        out_of_round: Standard deviation of the diameters of a stem in all directions, as a fraction of the
+            DBH.
         taper_sigma: Standard deviation of the taper, change of the diameter per height [m/m].
     """
 
@@ -139,19 +145,20 @@ class FigureLimits(NamedTuple):
 
 
 @compiled
-def table_figures(tracks: Rows, limits: FigureLimits) -> tuple[Float, Float, Float, Float, Bool]:
+def table_figures(tracks: Rows, limits: FigureLimits) -> tuple[Float, Float, Float, Float, Float, Bool]:
     """Return the attributes of all tracks for the tree table, each of shape (T,).
 
     Returns:
-        Observed arc [rad]; DBH [m]; its standard deviation [m]; mean eccentricity; and which tracks are
-        trees, see `is_confirmed`. DBH and its standard deviation are NaN where `diameter` has none, the
-        eccentricity is NaN without a finite one.
+        Observed arc [rad]; DBH [m]; its standard deviation [m]; standard deviation of each coordinate of the
+        centre by the shape of the stem [m], see `shape_sigma`; mean eccentricity; and which tracks are trees,
+        see `is_confirmed`. DBH and its standard deviation are NaN where `diameter` has none, the eccentricity
+        is NaN without a finite one.
     """
     T = tracks.sides.shape[0]
     coverage, dbh, dbh_sigma, mean = np.empty(T), np.empty(T), np.empty(T), np.full(T, np.nan)
-    confirmed = np.empty(T, np.bool_)
-    _fill_figures(tracks, limits, coverage, dbh, dbh_sigma, mean, confirmed)
-    return coverage, dbh, dbh_sigma, mean, confirmed
+    centre_sigma, confirmed = np.empty(T), np.empty(T, np.bool_)
+    _fill_figures(tracks, limits, coverage, dbh, dbh_sigma, centre_sigma, mean, confirmed)
+    return coverage, dbh, dbh_sigma, centre_sigma, mean, confirmed
 
 
 @compiled_borrowing
@@ -161,18 +168,42 @@ def _fill_figures(
     coverage: Float,
     dbh: Float,
     dbh_sigma: Float,
+    centre_sigma: Float,
     mean: Float,
     confirmed: Bool,
 ) -> None:
-    """Write the results of `table_figures` (observed arc [rad], DBH and its standard deviation [m], mean
-    eccentricity, is a tree) into the last five arrays, shape (T,), in place; `mean`, which contains NaN
-    before, is written for tracks with an eccentricity."""
+    """Write the results of `table_figures` into the arrays after `limits`, shape (T,), in place; `mean`,
+    which contains NaN before, is written for tracks with an eccentricity."""
     for t in range(tracks.sides.shape[0]):
         coverage[t] = sides_of(tracks.sides[t]) * WIDTH
         dbh[t], dbh_sigma[t] = diameter(tracks, t, coverage[t], limits)
+        centre_sigma[t] = shape_sigma(tracks.radius[t], tracks.radius_weight[t], coverage[t], limits)
         if tracks.eccentricities[t] > 0:
             mean[t] = tracks.eccentricity[t] / tracks.eccentricities[t]
         confirmed[t] = is_confirmed(tracks.verdict[t], tracks.hits[t], tracks.score[t], limits)
+
+
+@compiled_borrowing
+def one_sidedness(coverage: float, order: int) -> float:
+    """Return the mean of cos(order b) over views whose directions b show an observed arc [rad] together: from
+    1 for one view to 0 for views from all around."""
+    w = min(order * 0.5 * max(coverage - ONE_VIEW, 0.0), np.pi)
+    return np.sin(w) / w if w > 0.0 else 1.0
+
+
+@compiled_borrowing
+def shape_sigma(radius: float, weight: float, coverage: float, limits: FigureLimits) -> float:
+    """Return the standard deviation of each coordinate of the centre of a stem because it is not round [m]; 0
+    without a radius.
+
+    Args:
+        radius, weight: Weighted sum of the radii [m], and the sum of the weights.
+        coverage: Observed arc [rad].
+        limits: See FigureLimits.
+    """
+    if not weight > 0.0:
+        return 0.0
+    return CENTRE_GAIN * limits.out_of_round * radius / weight * one_sidedness(coverage, 1)
 
 
 @compiled_borrowing
@@ -208,11 +239,12 @@ def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tup
 
     For a diameter D of n views at distances r, with a mean distance |h| from breast height:
 
-    sigma^2 = 4 (sigma_views^2 / n + (EDGE b + UNEVEN)^2) + (out_of_round D)^2 + (taper_sigma |h|)^2
+    sigma^2 = 4 (sigma_views^2 / n + (EDGE b + UNEVEN)^2) + (out_of_round D)^2 (1 + (RADIUS_GAIN f)^2)
+              + (taper_sigma |h|)^2
 
-    where b is the larger of BEAM r and half the distance between returns. The last three terms do not shrink
-    with n: all views share the edges, the shape and the foot of the tree. The weights by height also widen
-    sigma_views, so that the sigma is conservative.
+    where b is the larger of BEAM r and half the distance between returns, and f the `one_sidedness` of the
+    views in the second order. The last three terms do not shrink with n: all views share the edges, the shape
+    and the foot of the tree. The weights by height also widen sigma_views, so that the sigma is conservative.
 
     Args:
         tracks: The tracks.
@@ -230,7 +262,8 @@ def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tup
         return np.nan, np.nan
     edge = EDGE * max(BEAM * reach, 0.5 * spacing)
     views = 1.0 / (weight * reach * reach) + (edge + UNEVEN) ** 2
-    stem = (limits.out_of_round * dbh) ** 2 + (limits.taper_sigma * above) ** 2
+    shape = 1.0 + (RADIUS_GAIN * one_sidedness(coverage, 2)) ** 2
+    stem = (limits.out_of_round * dbh) ** 2 * shape + (limits.taper_sigma * above) ** 2
     sigma = np.sqrt(4.0 * views + stem)
     if sigma > limits.dbh_sigma_max:
         return np.nan, np.nan

@@ -14,7 +14,17 @@ from pipeline.detection.cylinder_fit import BEAM
 from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
 from pipeline.tracking.kalman import ENGINES, H, process_noise, transition
-from pipeline.tracking.observation import EDGE, SECTORS, UNEVEN, seen_sides
+from pipeline.tracking.observation import (
+    EDGE,
+    ONE_VIEW,
+    RADIUS_GAIN,
+    SECTORS,
+    UNEVEN,
+    FigureLimits,
+    one_sidedness,
+    seen_sides,
+    shape_sigma,
+)
 from tests.pipeline.strategies import detections, seeds, track
 
 FOREST = preset("forest").tracking
@@ -276,7 +286,7 @@ def test_heading_variance_grows_across_the_ray_with_distance():
 
 @pytest.mark.parametrize("breast_height", [1.3, 1.0])
 def test_diameters_refer_to_breast_height(breast_height):
-    t = tracker(dbh_arc_min=0.0, breast_height=breast_height)
+    t = tracker(dbh_arc_min=0.0, dbh_sigma_max=0.5, breast_height=breast_height)
     seen = detections([[5.0, 0.0]], radius=0.2)
     for k, height in enumerate((0.7, 1.0, 1.6, np.nan)):
         track(t, k * 100_000_000, Pose2(), SURE, seen, heights=np.array([height]))
@@ -290,7 +300,7 @@ def test_the_measurement_is_the_position_of_the_state():
 
 
 def test_a_diameter_needs_three_radii_and_weighs_them():
-    t = tracker(dbh_arc_min=0.0)
+    t = tracker(dbh_arc_min=0.0, dbh_sigma_max=0.5)
     for k in range(3):
         assert np.isnan(show(t, k, [[5.0, 0.0]], radius=np.nan).dbh).all()
     trees = t.trees()
@@ -303,10 +313,43 @@ def test_a_diameter_needs_three_radii_and_weighs_them():
     weight, dbh = tracks.radius_weight[0], trees.dbh[0]
     reach, above = tracks.radius_reach[0] / weight, tracks.radius_above[0] / weight
     views = 1.0 / (weight * reach**2) + (EDGE * BEAM * reach + UNEVEN) ** 2
-    stem = (p.out_of_round * dbh) ** 2 + (p.taper_sigma * above) ** 2
+    one_sided = 1.0 + RADIUS_GAIN**2  # all views are from one place
+    stem = (p.out_of_round * dbh) ** 2 * one_sided + (p.taper_sigma * above) ** 2
     assert trees.dbh_sigma[0] == pytest.approx(np.sqrt(4.0 * views + stem))
     assert 0.02 < trees.dbh_sigma[0] < 0.1
     assert trees.observations.tolist() == [6]
+
+
+@pytest.mark.parametrize("views", [1, 4, 8, 12, 18])
+def test_the_errors_of_an_oval_stem_are_those_of_circles_that_are_fitted_to_it(views):
+    """Views 10 degrees apart: the closed form beside least squares, for all directions of the oval."""
+    oval = 0.01
+    across = np.linspace(-ONE_VIEW / 2, ONE_VIEW / 2, 201)
+    turned = np.radians(10.0) * np.arange(views)
+
+    def fitted(oval_at):
+        """Mean radius less 1 and mean centre over the views."""
+        results = []
+        for view in turned:
+            angle = view + across
+            r = 1.0 + oval * np.cos(2.0 * (angle - oval_at))
+            x, y, weight = r * np.cos(angle), r * np.sin(angle), np.sqrt(np.cos(across))  # even in bearing
+            design = np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))])  # small ovals
+            centre_radius = np.linalg.lstsq(
+                design * weight[:, None], (np.hypot(x, y) - 1.0) * weight, rcond=None
+            )
+            results.append(centre_radius[0])
+        return np.mean(results, axis=0)
+
+    errors = np.array([fitted(at) for at in np.linspace(0.0, np.pi, 24, endpoint=False)]) / oval
+    out_of_round = np.sqrt(0.5)  # of an amplitude of 1
+    seen = ONE_VIEW + np.radians(10.0) * views
+    by_shape = out_of_round * RADIUS_GAIN * one_sidedness(seen, 2)
+    assert np.sqrt(np.mean(errors[:, 2] ** 2)) == pytest.approx(by_shape, abs=0.1)
+    limits = FigureLimits(3, 0.0, 0.5, out_of_round, 0.0)
+    centre = np.sqrt(np.mean(errors[:, :2] ** 2))
+    sigma = shape_sigma(2.0, 2.0, seen, limits)  # radius 1
+    assert centre == pytest.approx(sigma, abs=0.1)
 
 
 def test_confirmation_comes_with_the_hits():
