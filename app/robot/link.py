@@ -10,7 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from app.robot.recorder import Recorder
@@ -25,6 +25,8 @@ MAX_BYTES = 128 << 20
 MAX_OTHERS = 20_000
 #: Fixed transforms are sent once and must outlast a long wait, e.g. for the compiler.
 MAX_FIXED = 1000
+#: They are kept for a recording that begins later, up to this size.
+MAX_FIXED_BYTES = 8 << 20
 
 #: A picture every 0.15 s is close enough to every scan; more of them fill the disk.
 PICTURE_PAUSE_NS = 150_000_000
@@ -76,6 +78,8 @@ class Inbox:
         self._others: _Lane = deque()
         self._fixed: _Lane = deque()
         self._fixed_channels: frozenset[int] = frozenset()
+        self._arrived_fixed: list[Message] = []
+        self._arrived_fixed_bytes = 0
         self._pictures: _Lane = deque()
         self._bytes = self._picture_bytes = 0
         self._serial = 0
@@ -100,6 +104,25 @@ class Inbox:
         """
         self._recorder, self._fixed_channels = recorder, frozenset(fixed)
 
+    def record(self, recorder: Recorder, now_ns: int) -> None:
+        """Set the recorder of a recording that begins while messages arrive. It first gets the fixed
+        transforms that arrived so far, as a late subscriber does, then the queued messages, so that the file
+        begins with the next scan that is mapped.
+
+        Args:
+            recorder: The recorder, which has a beginning.
+            now_ns: Present time of arrival [ns].
+        """
+        with self._lock:
+            lanes = (self._scans, self._others, self._pictures)
+            queued = [message for _, message in sorted(pair for lane in lanes for pair in lane)]
+            start_ns = min([now_ns, *(message.log_ns for message in queued)])
+            for message in self._arrived_fixed:
+                recorder.add(replace(message, log_ns=start_ns))
+            for message in queued:
+                recorder.add(message)
+            self._recorder = recorder
+
     def put(self, message: Message, *, is_scan: bool) -> None:
         """Record and queue a message; never wait. The oldest scans are skipped beyond MAX_SCANS, the oldest
         other messages beyond MAX_OTHERS. Beyond MAX_BYTES in all, the oldest scans are skipped first, then
@@ -113,7 +136,10 @@ class Inbox:
             if self._recorder is not None:
                 self._recorder.add(message)
             self._serial += 1
-            is_fixed = message.channel in self._fixed_channels and len(self._fixed) < MAX_FIXED
+            is_fixed = message.channel in self._fixed_channels
+            if is_fixed:
+                self._keep_fixed(message)
+            is_fixed = is_fixed and len(self._fixed) < MAX_FIXED
             lane = self._scans if is_scan else self._fixed if is_fixed else self._others
             lane.append((self._serial, message))
             self._bytes += len(message.payload)
@@ -180,6 +206,13 @@ class Inbox:
                 for lane in (self._scans, self._others, self._fixed):
                     for _, message in lane:
                         recorder.skip(message)
+
+    def _keep_fixed(self, message: Message) -> None:
+        """Keep a fixed transform for `record`; nothing beyond MAX_FIXED and MAX_FIXED_BYTES."""
+        size = self._arrived_fixed_bytes + len(message.payload)
+        if len(self._arrived_fixed) < MAX_FIXED and size <= MAX_FIXED_BYTES:
+            self._arrived_fixed.append(message)
+            self._arrived_fixed_bytes = size
 
     def _skip(self, lane: _Lane, reason: str) -> int:
         """Remove the oldest message of a queue, record that it was skipped, and return its size [bytes].

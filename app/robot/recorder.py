@@ -82,6 +82,11 @@ class Recorder:
         return f"{word} {self.path.name}, {self._file.tell() / 1e6:.0f} MB{missing}"
 
     @property
+    def is_open(self) -> bool:
+        """Whether it records, or will when the first message arrives."""
+        return not self.problem and not self._closing.is_set()
+
+    @property
     def begun(self) -> bool:
         """Whether the file has a beginning; it stays after the run."""
         return self._thread is not None

@@ -6,8 +6,10 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path as FilePath
 from typing import Any
 
 from app.robot.link import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox, Link
@@ -161,6 +163,10 @@ class LiveSource:
         self._version = -1
         self._began_ns = time.time_ns()
         self._recorder: Recorder | None = None
+        self._recording = threading.Lock()  # while a recording begins
+        self._recorded_from = 0
+        self._unrecorded: Counter[str] = Counter()  # of the recordings before the present one
+        self._refusal = ""
         self._publishes = False
         self._publisher: RosPublisher | None = None
         self._map_at_s = -_MAP_PAUSE_S
@@ -179,6 +185,30 @@ class LiveSource:
         self._recorder, self._publishes = recorder, publish
         self._watch = threading.Thread(target=self._watch_robot, name="live source", daemon=True)
         self._watch.start()
+
+    def record(self, path: FilePath, from_scan: int) -> None:
+        """Record the messages of the robot from now on; those that wait to be mapped are recorded as well.
+        Nothing while a recording goes on and after the end. If the file cannot be created, `recording` has
+        the reason. The results of the mapping and `use_parameters` follow.
+
+        Args:
+            path: The file; if it exists, a number is appended to its name.
+            from_scan: Index of the first scan that is read from now on.
+        """
+        with self._recording:
+            if self._ending.is_set() or (self._recorder is not None and self._recorder.is_open):
+                return
+            try:
+                recorder = Recorder(path)
+            except SourceError as error:
+                self._refusal = f"not recording: {error}"
+                return
+            if self._recorder is not None:
+                self._unrecorded.update(self._recorder.losses)
+            self._recorder, self._recorded_from, self._refusal = recorder, from_scan, ""
+            if self._choice is not None:
+                self._begin_recording(recorder, self._choice)
+                self._inbox.record(recorder, self._link.times.now_ns())
 
     # --- as a source -----------------------------------------------------------------------------
 
@@ -205,7 +235,8 @@ class LiveSource:
         read = {} if self._reader is None else self._reader.losses
         kept = {} if self._kept is None else self._kept.losses
         recorder = {} if self._recorder is None else self._recorder.losses
-        return {**self._link.losses, **self._inbox.losses, **recorder, **read, **kept}
+        unrecorded = self._unrecorded + Counter(recorder)
+        return {**self._link.losses, **self._inbox.losses, **unrecorded, **read, **kept}
 
     def records(self) -> Iterator[Record]:
         """Yield records when they arrive, until `stop`; then the recording of messages ends, and the records
@@ -303,12 +334,12 @@ class LiveSource:
 
     @property
     def recording(self) -> str:
-        """State of the recording in one line, "" if there is none."""
-        return "" if self._recorder is None else self._recorder.status
+        """State of the newest recording in one line, "" if there is none."""
+        return self._refusal or ("" if self._recorder is None else self._recorder.status)
 
     @property
     def recorded_file(self) -> str:
-        """Path of the file of the recording, "" if there is none."""
+        """Path of the file of the newest recording, "" if there is none."""
         return str(self._recorder.path) if self._recorder is not None and self._recorder.begun else ""
 
     def mapped(self, frame: Frame, path: Path, also: Mapping[str, bytes] | None = None) -> None:
@@ -346,7 +377,8 @@ class LiveSource:
             parameters: The parameters.
         """
         if self._recorder is not None:
-            self._recorder.add_parameters(revision, from_scan, parameters.model_dump())
+            in_file = max(from_scan - self._recorded_from, 0)
+            self._recorder.add_parameters(revision, in_file, parameters.model_dump())
 
     def stop(self) -> None:
         """End the iteration of `records`, and the watch of the robot; may be called in a signal handler."""
@@ -497,15 +529,20 @@ class LiveSource:
         fixed = [channel for channel in choice.channels if channel.topic.endswith("tf_static")]
         if choice.camera:
             self._camera = LiveCamera(choice.camera, fixed)
-        if self._recorder is not None:
-            header = {"uri": self.uri, "topics": [channel.topic for channel in choice.channels],
-                      "camera": [channel.topic for channel in choice.camera]}  # fmt: skip
-            self._recorder.begin(everything, header, choice.robot)
         if self._publishes and self._link.session is not None:
             self._publisher = RosPublisher(self._link.session, self._address.domain, choice.robot)
-        self._inbox.begin(self._recorder, [channel.number for channel in fixed])
-        self._choice, self._reader = choice, reader  # the mapping thread reads from here on
+        with self._recording:
+            if self._recorder is not None:
+                self._begin_recording(self._recorder, choice)
+            self._inbox.begin(self._recorder, [channel.number for channel in fixed])
+            self._choice, self._reader = choice, reader  # the mapping thread reads from here on
         self._link.subscribe(everything)
+
+    def _begin_recording(self, recorder: Recorder, choice: Choice) -> None:
+        """Write the beginning of a recording of the chosen topics."""
+        header = {"uri": self.uri, "topics": [channel.topic for channel in choice.channels],
+                  "camera": [channel.topic for channel in choice.camera]}  # fmt: skip
+        recorder.begin((*choice.channels, *choice.camera), header, choice.robot)
 
 
 def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:

@@ -283,6 +283,8 @@ class WorkerLoop:
             case protocol.Pause():
                 self._held = True
                 self._show(session.pause())
+            case protocol.Record(path=path):
+                session.start_recording(path)
             case protocol.EndRecording():
                 session.end_recording()
             case protocol.EndRun():

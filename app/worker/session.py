@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from app.batch.summary import driven, health_word, scans_left_out
@@ -444,6 +445,18 @@ class Session:
         self._warnings.clear()
         self._target.forget()
         self.shown.close()
+
+    def start_recording(self, path: str) -> None:
+        """Record a live run from now on, with the parameters in force; nothing if it is recorded, has ended,
+        or no robot is open. A run that is opened again is recorded to this path as well."""
+        robot, run = self._robot, self.run
+        if robot is None or self._request is None:
+            return
+        self._request = msgspec.structs.replace(self._request, record=path)
+        first = run.known if isinstance(run, Run) else 0
+        robot.record(FilePath(path), first)
+        if isinstance(run, Run):
+            robot.use_parameters(self._revision, first, self._parameters)
 
     def end_recording(self) -> bool:
         """Finish the recording of a live run, which waits up to 8 s for the disk, and return whether the run

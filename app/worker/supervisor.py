@@ -10,6 +10,8 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
+import msgspec
+
 from app.common.child_process import ChildProcess, exit_reason, python_module, starved_s
 from app.common.timers import cancel
 from app.sources.live_address import is_live
@@ -124,6 +126,8 @@ class WorkerProcess:
         """
         if isinstance(command, protocol.SetParameters | protocol.SetSpeed):
             self._settings[type(command)] = command
+        elif isinstance(command, protocol.Record) and self._open is not None:
+            self._open = msgspec.structs.replace(self._open, record=command.path)
         elif isinstance(command, protocol.Open):
             self._open = command
             if self._opening and self._clock() - self._opening_since > _REPLACE_AFTER_S:

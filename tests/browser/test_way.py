@@ -101,6 +101,39 @@ def test_a_live_run_is_ended_on_the_page_by_two_presses(dashboard: Dashboard):
     expect(page.locator("#back1")).to_be_visible()
 
 
+# A live run whose recording has a state; what its button reads before and after a press.
+RECORDING = """async (recording) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const file = recording && '/data/run.mcap';
+  state.status = { ...state.status, live: true, state: 'playing', recording, recorded_file: file };
+  changed('status');
+  const button = document.getElementById('recording'), before = button.textContent;
+  button.click();
+  return [before, button.textContent, button.title];
+}"""
+
+
+def test_a_recording_begins_with_one_press_and_ends_with_two(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    page.route("**/api/command", lambda route: route.fulfill(status=202, json={}))
+    for recording, text in (("", "○ Record"), ("recorded run.mcap, 3 MB", "○ Record again"),
+                            ("not recording: no space", "⚠ not recording")):  # fmt: skip
+        with page.expect_request("**/api/command") as request:
+            assert page.evaluate(RECORDING, recording)[0] == text
+        assert request.value.post_data_json == {"type": "record"}
+    before, asked, title = page.evaluate(RECORDING, "recording run.mcap, 3 MB")
+    assert (before, asked) == ("● recording 3 MB", "End recording?")
+    assert "/data/run.mcap" in title
+    with page.expect_request("**/api/command") as request:
+        page.evaluate(RECORDING, "recording run.mcap, 3 MB")
+    assert request.value.post_data_json == {"type": "end_recording"}
+    expect(page.locator("#problem")).to_contain_text("/data/run.mcap")
+    page.unroute("**/api/command")
+    page.evaluate(REAL_STATUS)
+    expect(page.locator("#recording")).to_be_hidden()
+
+
 SIGNALS = """() => {
   window.signals = [];
   navigator.vibrate = (pattern) => { window.signals.push('vibration'); return true; };

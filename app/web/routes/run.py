@@ -15,7 +15,7 @@ from fastapi import APIRouter
 from pydantic import Field, field_validator
 from starlette.responses import Response
 
-from app.common.settings import recordings_place
+from app.common.settings import Settings, recordings_place
 from app.sources.live_address import is_live
 from app.sources.opening import ask
 from app.sources.request import (
@@ -55,6 +55,10 @@ class _Pause(Body):
     type: Literal["pause"]
 
 
+class _Record(Body):
+    type: Literal["record"]
+
+
 class _EndRecording(Body):
     type: Literal["end_recording"]
 
@@ -89,7 +93,8 @@ class _SetSpeed(Body):
 
 
 _AnyCommand = Annotated[
-    _Play | _Pause | _EndRecording | _EndRun | _Advance | _Seek | _SetSpeed, Field(discriminator="type")
+    _Play | _Pause | _Record | _EndRecording | _EndRun | _Advance | _Seek | _SetSpeed,
+    Field(discriminator="type"),
 ]
 
 
@@ -134,11 +139,23 @@ async def status(dashboard: Dash) -> Response:
 
 
 @router.post("/command")
-async def command(body: _AnyCommand, dashboard: Dash) -> Response:
-    """POST /api/command: play, pause, advance, seek, set the speed, or end a live run or its recording. The
-    response is empty (202); the status reports the result. 503 if the worker is being restarted."""
-    await dashboard.command(msgspec.convert(body.model_dump(), Command))
+async def command(body: _AnyCommand, dashboard: Dash, settings: Deployment) -> Response:
+    """POST /api/command: play, pause, advance, seek, set the speed, end a live run, or begin or end its
+    recording. The response is empty (202); the status reports the result. 422 for a recording of what is not
+    live, 409 if there is no data folder for it, 503 if the worker is being restarted."""
+    fields = body.model_dump()
+    if isinstance(body, _Record):
+        fields["path"] = _new_recording(dashboard.source.uri, settings)
+    await dashboard.command(msgspec.convert(fields, Command))
     return json_reply({}, 202)
+
+
+def _new_recording(uri: str, settings: Settings) -> str:
+    """Return the path of a new recording of a run in the data folder. Raises BadRequestError if the run is
+    not live, StemmapError if there is no data folder."""
+    if not is_live(uri):
+        raise BadRequestError("only a live run can be recorded", where="record", remedy="Leave it out")
+    return str(recordings_place(settings, time.time()))
 
 
 @router.post("/loop")
@@ -163,9 +180,7 @@ async def open_source(body: _Source, dashboard: Dash, permitted: Permitted, sett
     chosen = {**body.model_dump(exclude={"record"}), "mount": mount_of_degrees(body.mount)}
     request = permitted_request(SourceRequest(**chosen), permitted)
     if body.record:
-        if not is_live(request.uri):
-            raise BadRequestError("only a live run can be recorded", where="record", remedy="Leave it out")
-        place = str(recordings_place(settings, time.time()))
+        place = _new_recording(request.uri, settings)
         request = Open(**{name: getattr(request, name) for name in chosen}, record=place)
     await dashboard.open(request)
     return json_reply({}, 202)

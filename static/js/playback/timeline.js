@@ -5,14 +5,14 @@ import { byId, el, setText } from "../core/dom.js";
 import { clock, count } from "../core/format.js";
 import { startPopover } from "../core/popover.js";
 import { attempted } from "../core/problem.js";
+import { atSecondPress } from "../core/second_press.js";
 import { isDrive, on, state } from "../core/store.js";
 import { newestFirst } from "../core/timing.js";
 import { timeLink } from "./time_link.js";
 
 const ICONS = { play: "M5 3l12 7-12 7z", pause: "M5 3h4v14H5zM12 3h4v14h-4z" };
 const STEPS = new Map([["back10", -10], ["back1", -1], ["on1", 1], ["on10", 10]]); // scans of each button
-const DOUBT = 4000; // [ms] in which a press on the button that asks again ends the run
-let dragging = false, doubting = 0;
+let dragging = false;
 
 // Whether the run is on its way to a scan that takes long to reach.
 export const isGoing = (status) => Boolean(status?.going_far);
@@ -25,16 +25,8 @@ export const advance = (scans) => ready() && send("advance", { scans });
 // A live run of which something is mapped.
 export const canEnd = () => Boolean(state.status?.live) && state.status.scan_index >= 0 && (playing() || state.status.state === "paused");
 
-// Nothing brings an ended run back: the button asks once more.
-export function endRun() {
-  const button = byId("end-run"), isSure = doubting > 0;
-  const settle = () => { doubting = 0; setText(button, "End run"); };
-  clearTimeout(doubting);
-  settle();
-  if (isSure) return send("end_run");
-  setText(button, "End it now?");
-  doubting = setTimeout(settle, DOUBT);
-}
+// Nothing brings an ended run back.
+export const endRun = atSecondPress((asks) => setText(byId("end-run"), asks ? "End it now?" : "End run"), () => send("end_run"));
 
 async function send(type, fields) {
   await attempted(() => command(type, fields));

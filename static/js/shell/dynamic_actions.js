@@ -16,7 +16,7 @@ import { openParameter } from "../tune/panel.js";
 import { attempt, isChanged, savedSets, shown, specOf, tuning, use } from "../tune/parameters.js";
 import { openDrawer, toTab } from "./actions.js";
 import { ofExtensions } from "./extensions.js";
-import { endRecording, isRecording } from "./status.js";
+import { canRecord, isRecording, pressRecording } from "./status.js";
 import { NAMES as TABS } from "./tabs.js";
 
 const AGAINST = [["both", "ground truth and annotations"], ["own", "ground truth only"], ["annotations", "annotations only"]];
@@ -59,7 +59,8 @@ const panels = () => [
   ...(state.annotations?.own == null ? [] : AGAINST.map(([value, words]) => [`Score against ${words}`, "", edits(() => { toTab("scores")(); scoreAgainst(value); })])),
   ["Upload a recording", "", edits(async () => { await openSources(); byId("upload-choose").focus(); })],
   ["Connect a robot or a sensor", "", edits(connectRobot)],
-  ...(isRecording() ? [["End the recording; the run goes on", "", endRecording, "stop finish live"]] : []),
+  ...(isRecording() ? [["End the recording; the run goes on", "", () => { byId("recording").focus(); pressRecording(); }, "stop finish live"]] : []),
+  ...(canRecord() ? [["Record the robot from now on", "", pressRecording, "live save file mcap"]] : []),
   ...(canEnd() ? [["End the live run; its map stays", "", edits(() => { byId("end-run").focus(); endRun(); }), "stop finish mapping robot"]] : []),
   ["Topics and mounting of a recording or robot", "", edits(async () => { await openSources(); byId("source-uri").value ||= state.status?.source ?? ""; byId("source-inside").open = true; })],
   ...(byId("warnings-button").hidden ? [] : [["Show the warnings", "", () => byId("warnings-button").click()]]),

@@ -6,6 +6,7 @@ import { byId, el, setText } from "../core/dom.js";
 import { capital, figure, NONE } from "../core/format.js";
 import { edits, looksOnly, refusedText } from "../core/permissions.js";
 import { attempted, showNews } from "../core/problem.js";
+import { atSecondPress } from "../core/second_press.js";
 import { changed, isDrive, on, state, trees } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 import { isGoing } from "../playback/timeline.js";
@@ -161,22 +162,30 @@ function showState() {
   showWay();
 }
 
-// The file and its size, or why there is none; a press on a recording ends it.
+// The file and its size, or why there is none. A press on a recording ends it, another press begins the next one.
 function showRecording(recording, isConnected) {
-  const box = byId("recording"), isOn = isConnected && recording.startsWith("recording");
-  box.hidden = !recording;
-  box.disabled = !isOn || looksOnly();
+  const box = byId("recording"), isOn = isConnected && isRecording(), canBegin = isConnected && canRecord();
+  box.hidden = !recording && !canBegin;
+  box.disabled = !(isOn || canBegin) || looksOnly();
   box.classList.toggle("bad", recording.startsWith("not"));
   const [word] = recording.split(/[ :]/), size = recording.split(", ").find((part) => part.endsWith(" MB")) ?? "";
-  setText(box, !isConnected && recording.startsWith("recording") ? "? recording: not known" : recording.startsWith("not") ? `⚠ ${recording.split(":")[0]}` : `${isOn ? "●" : "■"} ${word} ${size}`);
-  box.title = !isConnected ? `Before the connection was lost: ${recording}` : isOn ? `${recording}; press to end the recording, while the run goes on` : recording;
+  setText(box, !isConnected && recording.startsWith("recording") ? "? recording: not known" : isAsking && isOn ? "End recording?"
+    : recording.startsWith("not") ? `⚠ ${recording.split(":")[0]}` : canBegin ? `○ Record${recording ? " again" : ""}` : `${isOn ? "●" : "■"} ${word} ${size}`);
+  const told = [recording, state.status?.recorded_file].filter(Boolean).join("\n");
+  box.title = !isConnected ? `Before the connection was lost: ${told}`
+    : [told, isOn ? "Press twice to end the recording, while the run goes on" : canBegin ? `Press to record the messages of the robot from now on${recording ? ", to a new file" : ""}` : ""].filter(Boolean).join("\n");
 }
 
+let isAsking = false; // whether the next press ends the recording
 export const isRecording = () => (state.status?.recording ?? "").startsWith("recording");
-export const endRecording = edits(() => attempted(async () => {
+// A live run that is not recorded now, and sends or may send again.
+export const canRecord = () => Boolean(state.status?.live) && !/^(recording|finishing)/.test(state.status.recording) && ["playing", "waiting", "paused"].includes(state.status.state);
+const askToEnd = atSecondPress((asks) => { isAsking = asks; showState(); }, () => attempted(async () => {
+  const file = state.status.recorded_file;
   await command("end_recording");
-  showNews("The recording is being finished. The run goes on.");
+  showNews(`The recording is being finished${file ? `: ${file}` : ""}. The run goes on.`);
 }));
+export const pressRecording = edits(() => (isRecording() ? askToEnd() : attempted(() => command("record"))));
 
 // Whether a run plays and no message came for a while.
 function isOld() {
@@ -255,7 +264,7 @@ function showNotice(quiet) {
 const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 
 export function startStatus() {
-  byId("recording").addEventListener("click", endRecording);
+  byId("recording").addEventListener("click", pressRecording);
   build();
   on("status map evaluation annotations truth", show);
   on("status map", showWay);

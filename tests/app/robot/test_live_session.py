@@ -9,6 +9,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from app.robot.link import Inbox, Link
@@ -19,21 +20,24 @@ from app.worker.loop import WorkerLoop
 from app.worker.protocol import (
     Advance,
     Begin,
+    EndRecording,
     EndRun,
     FromWorker,
     Open,
     Opened,
     Pause,
     Play,
+    Record,
     Report,
     Seek,
+    SetParameters,
     Shown,
     ToWorker,
 )
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.io.readers import SourceOptions
+from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.topics import POINT_CLOUD
@@ -228,6 +232,57 @@ def test_an_ended_run_has_its_recording_and_keeps_its_map(sending, tmp_path: Pat
         until(lambda: on.status.state == "finished")
         assert on.shown[-1] == 10
     assert recorded_scans(tmp_path / "run.mcap") == 11
+
+
+def test_a_run_is_recorded_from_a_press_on_and_again_to_a_second_file(sending, drive: Path, tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    tuned = Parameters().replace({"clustering.min_points": 6})
+    with stage() as on:
+        link = mapped_link(on, sending)
+        link.times.now_ns = lambda: link.inbox._arrived_fixed[0].log_ns + 1
+        on.commands.put(Record(str(path)))
+        until(lambda: on.status.recording.startswith("recording run.mcap"))
+        sending(link, 11, SCANS)
+        until(lambda: on.shown[-1] == SCANS - 1)
+        on.commands.put(SetParameters(tuned.model_dump(), 4))
+        until(lambda: on.status.revision == 4)
+        on.commands.put(EndRecording())
+        until(lambda: on.status.recording.startswith("recorded run.mcap"))
+        assert on.status.recorded_file == str(path)
+        assert on.status.state == "playing"
+        on.commands.put(Record(str(path)))
+        until(lambda: on.status.recording.startswith("recording run-2.mcap"))
+    with closing(open_source(str(path))) as recording, closing(open_source(str(drive))) as whole:
+        known = recording.description
+        assert known.scans == SCANS - 11
+        mounted = whole.description.T_base_lidar  # the fixed transforms came before
+        np.testing.assert_array_equal(known.T_base_lidar.t, mounted.t)
+        assert mounted.t[2] == 0.9
+        first, then = known.revisions
+        assert (first.from_scan, then.from_scan) == (0, SCANS - 11)
+        assert then.values["clustering"]["min_points"] == 6
+    assert recorded_scans(tmp_path / "run-2.mcap") == 0
+
+
+def test_what_waits_to_be_mapped_is_in_a_recording_that_begins_later(sending, tmp_path: Path):
+    with stage() as on:
+        link = mapped_link(on, sending)
+        on.commands.put(Pause())
+        until(lambda: on.status.state == "paused")
+        sending(link, 11, SCANS)
+        on.commands.put(Record(str(tmp_path / "run.mcap")))
+        until(lambda: on.status.recording.startswith("recording"))
+    assert recorded_scans(tmp_path / "run.mcap") == SCANS - 11
+
+
+def test_a_file_that_cannot_be_created_is_told_and_the_run_goes_on(sending, tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with stage() as on:
+        link = mapped_link(on, sending)
+        on.commands.put(Record(str(tmp_path / "file" / "run.mcap")))
+        until(lambda: on.status.recording.startswith("not recording: cannot record"))
+        sending(link, 11, SCANS)
+        until(lambda: on.shown[-1] == SCANS - 1)
 
 
 def recorded_scans(path: Path) -> int:

@@ -253,6 +253,8 @@ async def test_a_live_run_is_recorded_to_a_new_file_in_the_data_folder(tmp_path:
         record = Path(told(dashboard)[-1].record)
         assert record.parent == tmp_path / "recordings"
         assert record.suffix == ".mcap"
+        assert (await client.post("/api/command", json={"type": "record"})).status_code == 202
+        assert Path(told(dashboard)[-1].path).parent == tmp_path / "recordings"
         answer = await client.post("/api/open", json={**body, "uri": "sim:stand"})
         assert answer.status_code == 422
         assert "only a live run can be recorded" in answer.text
@@ -261,6 +263,13 @@ async def test_a_live_run_is_recorded_to_a_new_file_in_the_data_folder(tmp_path:
         before = len(told(dashboard))
         assert (await client.post("/api/open", json=body)).status_code == 409
         assert len(told(dashboard)) == before
+
+
+async def test_only_a_live_run_is_recorded_later(both: Running) -> None:
+    client, _ = both
+    answer = await client.post("/api/command", json={"type": "record"})
+    assert answer.status_code == 422
+    assert "only a live run can be recorded" in answer.text
 
 
 @pytest.mark.parametrize(
