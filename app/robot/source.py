@@ -439,6 +439,11 @@ class LiveSource:
         notices, self._notices = self._notices, []
         return notices
 
+    @property
+    def silence_s(self) -> float | None:
+        """Seconds since the last scan arrived, None before the first."""
+        return self._link.silence_s
+
     def waiting_for(self) -> str:
         """Return why no scans arrive, as text; "" while they arrive."""
         silence_s = self._link.silence_s

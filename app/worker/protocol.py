@@ -55,7 +55,8 @@ class Status:
         scans_left_out: Number of scans that were lost or skipped, or that the reader refused.
         trees: Number of confirmed trees.
         distance_m: Driven distance [m].
-        health: Pose quality "good", "weak" or "lost", or why it is too early to know (see `health_word`).
+        health: Pose quality "good", "weak" or "lost", why it is too early to know (see `health_word`), or
+            "no data for 12 s" while a robot is silent.
         warnings: Warnings, each once, the newest last.
         revision: Revision of the parameters in force.
         going_to: Description of the sought time or scan until it is reached; empty otherwise.

@@ -514,14 +514,18 @@ class Session:
 
 def with_robot(status: Status, robot: LiveSource) -> Status:
     """Return the status with the fields of a live run: namespaces, waiting scans and recording of its robot.
-    If the run plays or waits and the robot is silent, the state is "waiting" and `detail` has the reason."""
+    If the run plays or waits and the robot is silent, the state is "waiting", `detail` has the reason, and
+    the quality of the last pose gives way to the time without data."""
     # While scans wait the robot is not silent, even if its link had no time to note it during a compilation.
     is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
     silent = robot.waiting_for() if is_asked else ""
+    silence_s = robot.silence_s
+    is_old = bool(silent) and silence_s is not None and status.scan_index >= 0
     return replace(
         status,
         state="waiting" if silent else status.state,
         detail=silent or status.detail,
+        health=f"no data for {silence_s:.0f} s" if is_old else status.health,
         live=True,
         robot=robot.robot,
         robots=robot.robots,

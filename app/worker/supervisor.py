@@ -270,8 +270,9 @@ class WorkerProcess:
                     silent_s = hung_s = 0.0
                     continue
                 now_s = starved_s(self.pid or 0)
-                silent_s += pause_s or 0.0
-                hung_s += max(0.0, (pause_s or 0.0) - (now_s - before_s))
+                waited_s = pause_s or limit_s / _NOTICE_SHARE  # the latter since a command, see `_write`
+                silent_s += waited_s
+                hung_s += max(0.0, waited_s - (now_s - before_s))
                 before_s = now_s
                 if hung_s >= limit_s:
                     return None

@@ -35,11 +35,39 @@ def test_a_person_in_the_way_is_reported(dashboard: Dashboard):
             expect(way).to_be_hidden()
 
 
+# Whether the line about the obstacle is seen: nothing lies on it.
+ON_TOP = """() => {
+  const way = document.getElementById('way'), box = way.getBoundingClientRect();
+  way.style.pointerEvents = 'auto';
+  const top = box.width > 0 && document.elementFromPoint(box.left + box.width / 2, box.top + box.height / 2);
+  way.style.pointerEvents = '';
+  return Boolean(top) && way.contains(top) && box.top >= 0;
+}"""
+
+
+def test_no_dialog_covers_the_stop_of_an_obstacle(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.open("sim:crossing?duration=12")
+    dashboard.pause()
+    dashboard.command({"type": "seek", "time_s": 10.6})
+    expect(page.locator("#way")).to_contain_text("Stop: obstacle")
+    for width, height in ((1280, 720), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        for button, dialog in (("source-button", "source-dialog"), ("share-button", "share-dialog"),
+                               ("keys-button", "keys-dialog"), ("palette-button", "palette")):  # fmt: skip
+            page.locator(f"#{button}").click()
+            expect(page.locator(f"#{dialog}")).to_be_visible()
+            dashboard.until(ON_TOP)
+            page.keyboard.press("Escape")
+            expect(page.locator(f"#{dialog}")).to_be_hidden()
+            dashboard.until(ON_TOP)
+
+
 # A live run that waits for its robot, with a long reason.
 SILENT = """async () => {
   const { state, changed } = await import('/static/js/core/store.js');
   const detail = 'Nothing heard for 12 s: robot forwarder-07 is gone; the map goes on when it is back';
-  state.status = { ...state.status, live: true, state: 'waiting', detail };
+  state.status = { ...state.status, live: true, state: 'waiting', detail, health: 'no data for 12 s' };
   changed('status');
   return document.querySelector('#notice').hidden;
 }"""
@@ -62,6 +90,10 @@ def test_a_notice_covers_no_button(dashboard: Dashboard):
             dashboard.drawn()
             assert not page.evaluate(SILENT)
             assert page.evaluate(COVERED, "#notice") == [], f"{name}, {width} px"
+    page.evaluate(SILENT)
+    health = page.locator("[data-figure=health]")
+    expect(health.locator("dd span")).to_have_text("no data for 12 s")
+    expect(health).to_have_class("warn")  # and not the quality of the last pose
     page.evaluate(REAL_STATUS)
 
 

@@ -63,9 +63,13 @@ const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first
 // A state that is worse than that of the newest scan stays for a moment while the run plays, so that a doubt about a few
 // scans can be read.
 const HELD_FOR = 2000; // [ms]
+const NO_DATA = /^no data/; // of a silent robot
+const noData = (since) => `no data for ${seconds(since)} s`;
 let held = { state: "good", reason: "", source: "", at: -Infinity };
 
 function health({ health: word, state: phase, source }) {
+  const silence = state.connected ? (isOld() ? noData(state.heardAt) : NO_DATA.test(word) && word) : state.lostAt && noData(state.lostAt);
+  if (silence) return [silence, "warn", "SLAM health"];
   const known = state.map?.health;
   const now = { state: word, reason: known?.state === word ? known.reason : "", source, at: performance.now() };
   const isWorse = TESTED.includes(word) && TESTED.indexOf(held.state) > TESTED.indexOf(word);
@@ -195,6 +199,7 @@ function isOld() {
 
 // Obstacles ahead of the robot, below the strip so that nothing moves. A screen reader announces changes of the zone, not of
 // the distance.
+const way = byId("way");
 const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? Path ahead not visible to the sensor" };
 
 function showWay() {
@@ -202,10 +207,14 @@ function showWay() {
   // Only a robot that drives on has something in its way, and only a scan of now shows it.
   const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld();
   const text = clearance && !quiet && WAY[clearance.zone];
-  byId("way").hidden = !text;
-  byId("way").dataset.zone = clearance?.zone ?? "";
-  if (text) setText(byId("way-zone"), text);
-  setText(byId("way-distance"), clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
+  way.hidden = !text;
+  way.dataset.zone = clearance?.zone ?? "";
+  const [zone, distance] = way.children;
+  if (text) setText(zone, text);
+  setText(distance, clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
+  // An open dialog covers everything outside of it.
+  const place = [...document.querySelectorAll("dialog:modal")].at(-1) ?? document.querySelector(".strip");
+  if (way.parentElement !== place) place.append(way);
 }
 
 let ahead = null; // [ms] of the server's clock before that of this machine; null while unknown
@@ -248,7 +257,7 @@ function showNotice(quiet) {
   const text = state.refused ? refusedText()
     : !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. The last state is shown; the page reconnects by itself.`
-    : quiet ? `No data for ${seconds(state.heardAt)} s. The last state is shown.`
+    : quiet ? `${capital(noData(state.heardAt))}. The last state is shown.`
     : isGoing(status) ? "" : status?.detail ?? ""; // the line above the timeline shows the progress of a seek
   notice.hidden = !text;
   const failed = state.connected && status?.state === "failed";
@@ -268,6 +277,7 @@ export function startStatus() {
   build();
   on("status map evaluation annotations truth", show);
   on("status map", showWay);
+  document.addEventListener("toggle", showWay, true); // of dialogs
   on("status connection", showState);
-  setInterval(showState, 1000);
+  setInterval(() => { showState(); show(); }, 1000);
 }

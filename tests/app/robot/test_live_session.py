@@ -176,6 +176,7 @@ def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
         link.silence_s, link.there, link.version = 7.0, [], 5
         until(lambda: on.status.state == "waiting")
         until(lambda: on.status.detail.startswith("Nothing heard for 7 s: robot robot1 is gone"))
+        assert on.status.health == "no data for 7 s", "the quality of the last pose says nothing of now"
         until(lambda: "robot robot1 sends no scans any more" in on.status.warnings)
         announce(link, sending)
         until(lambda: "robot robot1 sends scans again" in on.status.warnings)

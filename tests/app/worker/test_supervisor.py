@@ -328,6 +328,23 @@ async def test_a_run_that_stops_answering_is_reported_and_replaced() -> None:
         await worker.close()
 
 
+async def test_the_time_without_an_answer_counts_from_the_command_of_an_idle_run() -> None:
+    said = Said()
+    worker = WorkerProcess(FAKE, silence_limit_s=9.0)  # a sixth of it is reported
+    await worker.start(said)
+    try:
+        await worker.send(Open("fake:100000"))
+        await said.opened()
+        await said.state("paused")
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGSTOP)
+        await worker.send(Play())
+        assert (await said.state("waiting")).detail.endswith("has not answered for 2 s")
+        os.kill(worker.pid, signal.SIGCONT)
+    finally:
+        await worker.close()
+
+
 async def test_a_worker_that_gets_no_processor_is_reported_and_not_replaced(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
