@@ -315,7 +315,7 @@ class Dashboard:
 
     def _broadcast_events(self) -> None:
         """Broadcast the events of the run."""
-        self.live.publish("events", self.events.as_plain())
+        self.live.publish("events", {**self.events.as_plain(), "start_s": self.start_ns / 1e9})
 
     async def _send_parameters(self) -> None:
         """Send the parameters in force to the worker."""
@@ -358,7 +358,7 @@ class Dashboard:
         the views of the new map follow."""
         self.seen = SeenRecorder()
         self.live.publish("remapped", msgspec.to_builtins(changes))
-        self.events.remapped(changes.confirmed, changes.time_s)
+        self.events.remapped(changes.confirmed, changes.time_s, live=self.status.live)
         self._broadcast_events()
         self.selector.remove({change.number for change in changes.changes if change.kind == "vanished"})
 
@@ -520,7 +520,12 @@ class Dashboard:
         if status.recorded_file and (file := FilePath(status.recorded_file)) not in self.recordings:
             self.recordings.append(file)
         self.live.publish("status", status)
-        if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
+        if status.scan_index < 0:
+            return
+        is_new = self.events.warned(status.warnings, status.time_s)
+        if status.live and status.state == "waiting":
+            is_new |= self.events.silent(status.detail, status.time_s)
+        if is_new:
             self._broadcast_events()
 
 

@@ -1,4 +1,4 @@
-"""Events of the run, which the page shows on the timeline."""
+"""Events of the run, which the page shows on the timeline and in its log."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.config.model import Value
-from pipeline.types.records import Float, Frame
+from pipeline.types.records import Float, Frame, Zone
 
-Kind = Literal["tree", "warning", "change", "health", "annotation"]
+Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "silence"]
 
 _OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
@@ -24,17 +24,20 @@ class Event:
 
     Attributes:
         time_s: Time since the first scan of the run [s].
-        kind: Tree mapped, warning, parameters changed, pose quality changed, or annotation.
+        kind: Tree mapped, warning, parameters changed, pose quality changed, annotation, obstacle in the stop
+            zone, or robot without data.
         text: Description for people.
+        lasts: Whether it lasts until the next event of its kind.
     """
 
     time_s: float
     kind: Kind
     text: str
+    lasts: bool = False
 
 
 class Events:
-    """Events of a run, at most 400; the oldest are removed first.
+    """Events of a run, at most 400; the oldest trees are removed first, then the oldest others.
 
     After a change of parameters, events later than the current scan remain, flagged as from before the
     change, until the run reaches them again.
@@ -46,6 +49,7 @@ class Events:
         self._confirmed: set[int] = set()
         self._warnings: frozenset[str] = frozenset()
         self._health = "good"
+        self._lasting: frozenset[Kind] = frozenset()
         self._base: tuple[str, dict[str, Value]] | None = None
         self._edits = ("", 0)
 
@@ -55,6 +59,7 @@ class Events:
         self._before.clear()
         self._confirmed.clear()
         self._warnings, self._health, self._base = frozenset(), "good", None
+        self._lasting = frozenset()
         self._edits = ("", 0)
 
     def shown(self, frame: Frame, time_s: float, confirmed_s: Float | None = None) -> bool:
@@ -62,7 +67,7 @@ class Events:
 
         A tree that is confirmed again after stepping back keeps the event of its first confirmation. Flagged
         events up to this time are removed. The pose quality has an event when its state changes; a run begins
-        as "good".
+        as "good". An obstacle in the stop zone has an event when it comes and goes. A silence ends.
 
         Args:
             frame: Shown frame; while seeking, not every frame is shown.
@@ -83,21 +88,39 @@ class Events:
         if health.state != self._health:
             self._health = health.state
             text = f"SLAM {health.state}: {health.reason}" if health.reason else f"SLAM {health.state}"
-            self._note(f"health {frame.index}", Event(time_s, "health", text))
+            self._note(f"health {frame.index}", Event(time_s, "health", text, health.state != "good"))
+        ahead = frame.clearance
+        is_stop = ahead is not None and ahead.zone == Zone.STOP
+        stop = f"Obstacle in the stop zone, {ahead.ahead:.1f} m ahead" if ahead is not None else ""
+        self._turn("stop", is_stop, time_s, stop if is_stop else "No obstacle in the stop zone")
+        self._turn("silence", False, time_s, "Data again")
         return self._events.keys() != known or bool(passed)
 
-    def remapped(self, confirmed: list[tuple[int, float]], time_s: float) -> None:
+    def silent(self, why: str, time_s: float) -> bool:
+        """Add an event for a robot that sends no data, unless it has one; it ends with the next shown scan.
+        Return whether it was added.
+
+        Args:
+            why: The reason.
+            time_s: Time of the last scan [s since the first scan].
+        """
+        return self._turn("silence", True, time_s, why[:_LONGEST])
+
+    def remapped(self, confirmed: list[tuple[int, float]], time_s: float, *, live: bool = False) -> None:
         """Replace the events of trees by those of `confirmed`, and remove those of the pose quality, after
         the run was mapped again. Old ones later than the current scan are flagged as from before the change.
 
         Args:
             confirmed: Number and confirmation time [s] of each tree.
             time_s: Time of the current scan [s].
+            live: The run is live: its log keeps how good the pose was while the robot drove.
         """
         self._set_aside(lambda event: event.time_s > time_s)
-        self._events = {k: e for k, e in self._events.items() if e.kind not in _OF_THE_MAP}
+        replaced = ("tree",) if live else _OF_THE_MAP
+        self._events = {k: e for k, e in self._events.items() if e.kind not in replaced}
         self._confirmed = {number for number, _ in confirmed}
-        self._health = "good"
+        if not live:
+            self._health = "good"
         for number, at in confirmed:
             self._note(f"tree {number}", Event(at, "tree", f"Tree {number} mapped"))
 
@@ -151,18 +174,31 @@ class Events:
 
     def as_plain(self) -> dict[str, Any]:
         """Return {"events": [...]}, a list of a dict for each event, ordered by time, with `t` [s since the
-        first scan], `kind` and `text`. Events from before a change of parameters also have `before`, True;
-        they are included only up to a total of _MOST events."""
+        first scan], `kind` and `text`. Events that last also have `for_s`, their duration [s], None while
+        they last; events from before a change of parameters `before`, True. The latter are included only up
+        to a total of _MOST events."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]
         marks.sort(key=lambda mark: mark[0].time_s)
-        return {
-            "events": [
-                {"t": round(e.time_s, 2), "kind": e.kind, "text": e.text, **({"before": True} if old else {})}
-                for e, old in marks
-            ]
-        }
+        ends: dict[str, float] = {}  # by the kind, times of the following events
+        plain: list[dict[str, Any]] = []
+        for event, old in reversed(marks):
+            each: dict[str, Any] = {"t": round(event.time_s, 2), "kind": event.kind, "text": event.text}
+            if event.lasts:
+                end_s = ends.get(event.kind)
+                each["for_s"] = None if end_s is None else round(end_s - event.time_s, 2)
+            ends[event.kind] = event.time_s
+            plain.append({**each, "before": True} if old else each)
+        return {"events": plain[::-1]}
+
+    def _turn(self, kind: Kind, on: bool, time_s: float, text: str) -> bool:
+        """Add an event if what lasts begins or ends with it; return whether it does."""
+        if on == (kind in self._lasting):
+            return False
+        self._lasting ^= {kind}
+        self._note(f"{kind} {on} {time_s:.2f}", Event(time_s, kind, text, on))
+        return True
 
     def _set_aside(self, which: Callable[[Event], bool]) -> set[str]:
         """Flag the events of kind "tree" or "health" for which `which` is True as from before a change;
@@ -184,7 +220,8 @@ class Events:
         return dict(zip(frame.trees.number[rows].tolist(), confirmed_s[rows].tolist(), strict=True))
 
     def _note(self, key: str, event: Event) -> None:
-        """Add an event unless one has its key, and remove the oldest beyond _MOST."""
+        """Add an event unless one has its key; beyond _MOST, remove the oldest tree, or the oldest event."""
         self._events.setdefault(key, event)
         while len(self._events) > _MOST:
-            del self._events[next(iter(self._events))]
+            trees = (known for known, each in self._events.items() if each.kind == "tree")
+            del self._events[next(trees, next(iter(self._events)))]

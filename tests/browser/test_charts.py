@@ -67,3 +67,42 @@ def test_quantities_are_chosen_have_one_cursor_and_a_click_goes_there(dashboard:
     dashboard.tab("Charts")
     dashboard.until(f"() => ({DRAWN})()?.names.join() === 'trees'")
     page.locator("#chart-choice").select_option("distance")
+
+
+# Events as of a live run, whose clock is known.
+LOGGED = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.events = [
+    { t: 2, kind: 'tree', text: 'Tree 1 mapped' },
+    { t: 65, kind: 'stop', text: 'Obstacle, 0.8 m ahead', for_s: 3.25 },
+    { t: 68.25, kind: 'stop', text: 'No obstacle in the stop zone' },
+    { t: 70, kind: 'silence', text: 'gone', for_s: null },
+  ];
+  state.eventsStart = 1764460800;
+  changed('events');
+}"""
+
+
+def test_the_log_lists_stops_and_silences_with_their_times(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.pause()
+    dashboard.tab("Charts")
+    page.locator("#chart-choice").select_option("log")
+    page.evaluate(LOGGED)
+    rows = page.locator("#log tbody tr")
+    expect(rows).to_have_count(2)
+    expect(rows.first.locator("td").first).to_have_text("1:05.0")
+    expect(rows.first).to_contain_text("3.25 s")
+    expect(rows.last).to_contain_text("lasts")
+    page.locator("#log-kind").select_option("tree")
+    expect(rows).to_have_count(1)
+    page.locator("#log-kind").select_option("lasting")
+    with page.expect_download() as saved:
+        page.locator("#chart-csv").click()
+    assert saved.value.path().read_text().splitlines() == [
+        "time_s,date,kind,duration_s,what",
+        '65,2025-11-30T00:01:05.000Z,stop,3.25,"Obstacle, 0.8 m ahead"',
+        "70,2025-11-30T00:01:10.000Z,silence,,gone",
+    ]
+    page.locator("#chart-choice").select_option("time")
+    expect(page.locator("#log")).to_be_hidden()

@@ -93,7 +93,7 @@ def test_a_notice_covers_no_button(dashboard: Dashboard):
     page.evaluate(SILENT)
     health = page.locator("[data-figure=health]")
     expect(health.locator("dd span")).to_have_text("no data for 12 s")
-    expect(health).to_have_class("warn")  # and not the quality of the last pose
+    expect(health).to_have_class("warn long")  # and not the quality of the last pose
     page.evaluate(REAL_STATUS)
 
 

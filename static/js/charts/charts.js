@@ -10,6 +10,7 @@ import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
 import { keepFresh, throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
+import { saveLog, showLog } from "./log.js";
 
 const EVERY = 2000; // [ms] between two updates
 const CURSOR_EVERY = 200; // [ms] between two moves of the cursor
@@ -140,7 +141,13 @@ const draw = keepFresh(async () => {
   if (!visible("charts")) return;
   busy = true;
   try {
-    const kind = byId("chart-choice").value;
+    const kind = byId("chart-choice").value, isLog = kind === "log";
+    byId("log").hidden = !isLog;
+    if (isLog) {
+      byId("chart").hidden = byId("chart-empty").hidden = byId("chart-png").disabled = true;
+      byId("chart-csv").disabled = false;
+      return showLog();
+    }
     if (!plotly) showText("Loading …");
     const [Plotly, drawing] = await Promise.all([load(), drawingOf(kind)]);
     const isText = typeof drawing === "string"; // why there is no plot
@@ -183,6 +190,7 @@ async function savePng() {
 
 // A matrix as a table with tree numbers in the first row and column; curves as rows of time, curve and value.
 function saveTable() {
+  if (byId("chart-choice").value === "log") return saveLog();
   const chart = byId("chart");
   if (chart.hidden || !chart.data) return;
   const [first] = chart.data;
@@ -204,6 +212,7 @@ export function startCharts() {
   });
   on("tab", () => visible("charts") && showChosen());
   on("tab theme", draw);
+  on("events", () => byId("chart-choice").value === "log" && draw());
   on("map", moveCursor);
   setInterval(() => state.status?.state !== "failed" && draw(), EVERY);
 }

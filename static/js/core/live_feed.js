@@ -18,7 +18,7 @@ const receivers = {
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   annotations(message) { state.annotations = message; },
   selection(message) { receiveSelection(message.tree ?? null, message.cluster ?? null, message.place ?? null); },
-  events(message) { state.events = message.events; },
+  events(message) { Object.assign(state, { events: message.events, eventsStart: message.start_s }); },
   view(message) { state.view = message; },
   remapped(message) { state.remapped = message.ghost ? message : null; },
   rough(message) { state.rough = message.places ? { ...message, ghost: message.places.map(([x, y]) => [x, y, null]), changes: [] } : null; },

@@ -294,6 +294,16 @@ async def test_a_restarted_worker_stands_at_the_start_and_says_so(dashboard: Das
     assert dashboard.status.detail == ""
 
 
+async def test_a_silence_of_a_robot_is_logged_with_the_time_of_its_last_scan(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened(run=1))
+    await dashboard.receive(Shown(1, 0.0, frame(0, 0), 0, path([0.0])))
+    silent = Status("waiting", "Nothing heard for 2 s: the robot is gone", live=True, scan_index=0)
+    await dashboard.receive(Report(silent))
+    told = browser_knows(dashboard)["events"]
+    assert told["events"][-1] == {"t": 0.0, "kind": "silence", "text": silent.detail, "for_s": None}
+    assert told["start_s"] == pytest.approx(1e-9 * frame(0, 0).stamp_ns)
+
+
 async def test_playing_a_dead_worker_plays_once_it_is_back(dashboard: Dashboard) -> None:
     await dashboard.receive(opened())
     worker(dashboard).pid = None

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.dashboard.events import Events
-from pipeline.types.records import Health
+from pipeline.types.records import Clearance, Health, Zone
 from tests.app.fakes import frame
 
 
@@ -47,6 +47,41 @@ def test_health_is_marked_when_it_changes_and_a_warning_when_it_is_new():
         (0.5, "health", "SLAM good"),
         (0.6, "warning", "jumped"),
     ]
+
+
+def lasting(events: Events) -> list[tuple[float, str, float | None]]:
+    return [(e["t"], e["kind"], e["for_s"]) for e in events.as_plain()["events"] if "for_s" in e]
+
+
+def test_stops_silences_and_doubts_are_logged_with_their_durations():
+    events = Events()
+    weak, lost = Health(state="weak", reason="the wheels slip"), Health(state="lost", reason="no trees")
+    stopped = replace(seen(2, 0), clearance=Clearance(Zone.STOP, ahead=0.8))
+    assert events.shown(seen(0, 0, weak), 0.0)
+    assert events.shown(seen(1, 0, lost), 0.4)
+    assert events.shown(stopped, 1.0)
+    assert not events.shown(stopped, 1.1)
+    assert lasting(events) == [(0.0, "health", 0.4), (0.4, "health", 0.6), (1.0, "stop", None)]
+    assert events.shown(replace(seen(4, 0), clearance=Clearance(Zone.SLOW, ahead=1.5)), 3.5)
+    assert events.silent("Nothing heard for 2 s: the robot is gone", 3.5)
+    assert not events.silent("Nothing heard for 3 s: the robot is gone", 3.5)
+    assert lasting(events)[-1] == (3.5, "silence", None)
+    assert events.shown(seen(5, 0), 15.5)
+    assert lasting(events)[-2:] == [(1.0, "stop", 2.5), (3.5, "silence", 12.0)]
+    assert (1.0, "stop", "Obstacle in the stop zone, 0.8 m ahead") in marks(events)
+    assert events.silent("gone again", 15.5)
+
+
+def test_a_log_of_a_live_run_outlasts_many_trees_and_a_rerun():
+    events = Events()
+    events.shown(seen(0, 0, Health(state="lost", reason="no trees")), 0.0)
+    events.shown(seen(1, 900), 5.0)
+    assert lasting(events) == [(0.0, "health", 5.0)]
+    events.remapped([(1, 0.2)], 5.0, live=True)
+    assert lasting(events) == [(0.0, "health", 5.0)]
+    assert events.shown(seen(2, 0, Health(state="weak", reason="again")), 6.0)
+    events.remapped([(1, 0.2)], 6.0)
+    assert lasting(events) == []
 
 
 def test_a_slider_that_moves_is_one_change_and_one_that_came_back_is_none():
