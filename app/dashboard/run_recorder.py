@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import io
 import logging
+import time
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from app.batch.run_edits import reviews_of
 from app.batch.summary import lost_share
 from app.dashboard.payload import trees_payload, truth_payload
 from app.dashboard.shown_run import ShownRun, in_file, truth_in_file
+from app.sources.live_address import is_live
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.store.records import Change, Content, NewRun, RunFigures
@@ -103,6 +105,8 @@ class RunRecorder:
         if run is None:
             return
         name = FilePath(opened.uri.rstrip("/")).name or opened.uri
+        if is_live(opened.uri):  # an address names every run of a robot
+            name = f"{name}, {time.strftime('%Y-%m-%d %H:%M')}"
         beginning = NewRun(run, name, opened.kind, msgspec.structs.replace(source, uri=opened.uri))
         self._page = _Page(beginning, opened.scans)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 
 from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
@@ -75,6 +75,15 @@ def test_runs_are_stored_renamed_deleted_and_replayed(own: Dashboard, tmp_path: 
     page.reload()
     page.get_by_role("button", name=folder.name).click()
     expect(page.locator("#run-detail .empty")).to_contain_text("run.json is damaged")
+
+    def as_live(route: Route) -> None:
+        route.fulfill(json={**route.fetch().json(), "live": True})
+
+    page.route("**/api/runs/*", as_live)
+    rows.nth(1).get_by_role("button").click()
+    expect(page.get_by_role("button", name="Rename")).to_be_visible()
+    expect(page.get_by_role("button", name="Replay")).to_be_hidden()  # nothing can be replayed
+    page.unroute("**/api/runs/*")
     rows.nth(1).get_by_role("button").click()
     page.get_by_role("button", name="Replay").click()
     expect(page.locator("#source-name")).to_have_text("sim:stand")

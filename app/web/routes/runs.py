@@ -122,7 +122,7 @@ async def replay(key: Key, dashboard: Dash, settings: Deployment, permitted: Per
     run, 409 if it was live or its source cannot be opened, 422 if its parameters are not valid in this
     version."""
     run = await whole_run(key, settings, dashboard)
-    if is_live(run["uri"]):  # its address would end the open run, and map what the robot sends now
+    if run["live"]:  # its address would end the open run, and map what the robot sends now
         raise StemmapError(
             "a live run cannot be replayed", where=run["name"], remedy="Open its recording, if one was made"
         )
@@ -209,7 +209,8 @@ async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], 
 async def whole_run(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
     """Return a run as a dict of JSON values: the keys of `_row` for a record, or of
     `app.dashboard.inspection_process.finished` for a folder, with `key`, `map`, `revisions` (list of
-    `_revision`; [] for a folder) and `differences`, see `_differences`.
+    `_revision`; [] for a folder), `differences`, see `_differences`, and `live`, whether it was a live run,
+    which cannot be replayed.
 
     Args:
         key: Number of a record, or "folder:" and the name of a finished folder.
@@ -230,7 +231,8 @@ async def whole_run(key: str, settings: Settings, dashboard: Dashboard) -> dict[
         number = _number(key)
         row = await dashboard.reviewed_runs.whole(number)
         run = {**_row(row), "map": row["map"], "revisions": [_revision(each) for each in row["revisions"]]}
-    return {**run, "differences": _differences(run["preset"], run["parameters"])}
+    differences = _differences(run["preset"], run["parameters"])
+    return {**run, "differences": differences, "live": is_live(run["uri"])}
 
 
 def _differences(name: str, parameters: dict[str, Any]) -> dict[str, Any]:

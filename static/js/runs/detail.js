@@ -64,7 +64,7 @@ function head(run, { replay, rename, remove }) {
   const title = el("h2", { text: run.name });
   const own = run.id !== undefined; // folders are renamed and deleted outside of stemmap
   return el("div", { class: "run-head" }, title,
-    el("button", { class: "primary", id: "run-replay", "data-edit": true, text: "Replay", title: "Open the recording in the dashboard, where it is mapped again with the parameters of this run", onclick: guarded(() => replay(run)) }),
+    el("button", { class: "primary", id: "run-replay", hidden: run.live, "data-edit": true, text: "Replay", title: "Open the recording in the dashboard, where it is mapped again with the parameters of this run", onclick: guarded(() => replay(run)) }),
     ...(own ? [
       el("button", { id: "run-rename", "data-edit": true, text: "Rename", onclick: () => edit(title, run, guarded, rename) }),
       el("button", { id: "run-delete", "data-edit": true, text: "Delete", title: "Delete this run; it can be restored", onclick: guarded(() => remove(run)) })] : []),

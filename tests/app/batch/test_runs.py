@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
@@ -188,7 +189,12 @@ async def test_a_live_run_is_not_replayed_and_the_open_run_goes_on(both: Running
     worker = dashboard.worker
     assert isinstance(worker, FakeWorker)
     before = list(worker.commands)
-    key = next(row["key"] for row in await runs(client) if row["uri"].startswith("zenoh:"))
+    listed = {row["uri"].partition(":")[0]: row for row in await runs(client)}
+    key = listed["zenoh"]["key"]
+    assert re.fullmatch(r"127.0.0.1:7447, \d{4}-\d\d-\d\d \d\d:\d\d", listed["zenoh"]["name"])
+    assert listed["other"]["name"] == "other:"
+    assert (await client.get(f"/api/runs/{key}")).json()["live"] is True
+    assert (await client.get(f"/api/runs/{listed['other']['key']}")).json()["live"] is False
     answer = await client.post(f"/api/runs/{key}/replay")
     assert answer.status_code == 409
     assert "recording" in answer.text
