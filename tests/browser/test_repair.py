@@ -252,3 +252,35 @@ def test_a_merge_of_trees_with_contradicting_diameters_says_so(person: Dashboard
         f"it.trees.some(tree => tree.number === {a['number']} && tree.sigma_dbh_cm > {0.8 * half})",
     )
     assert max(tree["observations"] for tree in trees(person)) <= person.ask("/api/status")["scan_index"] + 1
+
+
+# The letters that are drawn for things with a class, and the legend for some marks.
+SYMBOLS = """async () => {
+  const [{ classedThings, drawTruth }, { state, changed }] = await Promise.all([
+    import('/static/js/map/draw.js'), import('/static/js/core/store.js'),
+  ]);
+  const letters = [];
+  const get = (_, name) => (name === 'fillText' ? (text) => letters.push(text) : () => {});
+  const pen = new Proxy({}, { get, set: () => true });
+  const repair = [
+    { kind: 'class', places: [[1, 2]], value: 'pole' }, { kind: 'class', places: [[3, 4]], value: 'bush' },
+    { kind: 'class', places: [[3, 4]], value: 'tree' }, { kind: 'delete', places: [[5, 6]] },
+  ];
+  const things = classedThings({ annotations: { others: { repair } } });
+  for (const thing of [...things, { x: 0, y: 0, kind: 'person' }]) {
+    drawTruth(pen, { scale: 10, toScreen: (x, y) => [x, y] }, thing);
+  }
+  state.truth = [{ x: 7, y: 8, dbh_cm: null, kind: 'tree' }];
+  state.annotations = { ...state.annotations, trees: [{ id: 1, x: 7, y: 8, kind: 'tree', dbh_cm: null }],
+    others: { repair } };
+  changed('truth');
+  return letters;
+}"""
+
+
+def test_each_class_has_a_symbol_and_annotations_are_not_called_true(person: Dashboard):
+    page = person.page
+    expect(page.locator("#legend-truth")).to_have_text("true tree")
+    assert page.evaluate(SYMBOLS) == ["P", "H"]
+    expect(page.locator("#legend-truth")).to_have_text("annotated tree")
+    expect(page.locator("#legend-other")).to_have_text("P pole")

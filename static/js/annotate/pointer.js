@@ -6,6 +6,7 @@ import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { clusters, trees } from "../core/store.js";
 import { colours } from "../core/theme.js";
+import { verdictOf } from "../core/verdicts.js";
 import { drawCircle, drawText, treeAt } from "../map/draw.js";
 import { onSceneLoad } from "../scene/scene.js";
 import { viewOf } from "../scene/viser_client.js";
@@ -87,9 +88,11 @@ export function drawAnnotations(pen, view) {
   for (const row of rows()) {
     const { x, y } = placeOf(row);
     Object.assign(pen, { fillStyle: colours.truth, strokeStyle: colours.surface, lineWidth: 1.5 });
-    drawCircle(pen, ...view.toScreen(x, y), 4);
+    const [px, py] = view.toScreen(x, y);
+    drawCircle(pen, px, py, 4);
     pen.fill();
     pen.stroke();
+    if (row.kind !== "tree") drawText(pen, verdictOf(row.kind)[0], px, py + 3.5, { font: "700 10px", margin: 2 });
   }
   const chosen = rowOf(draft.chosen);
   if (chosen && treeNumberOf(chosen) === null) { // else the ring is that of its tree

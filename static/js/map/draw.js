@@ -13,6 +13,7 @@ export const symbolRadius = (tree, scale) =>
 
 const SECTORS = 36; // around a trunk
 const LEFT_OUT = 0.2; // opacity of trees that the filter of the table leaves out
+const DIAMOND = 8; // [px] from the centre of a diamond to its corners
 const TREE_REACH = 14; // [px] around the symbol of a tree
 
 // The tree at a point of the canvas [px], or null.
@@ -37,6 +38,7 @@ function drawContent(pen, view, state, isRejected) {
   drawLine(pen, view, alignedOdometry(state), colours.odometry, 1.2);
   drawLine(pen, view, state.path, colours.path, 2);
   for (const truth of state.truth ?? []) drawTruth(pen, view, truth);
+  for (const thing of classedThings(state)) drawTruth(pen, view, thing);
   if (state.ghost) drawGhost(pen, view, state.ghost);
   const trees = state.map?.trees ?? [];
   drawClusters(pen, view, state.map?.clusters);
@@ -126,11 +128,21 @@ export function drawTruth(pen, view, truth) {
   Object.assign(pen, { strokeStyle: colours.truth, lineWidth: 1.6 });
   pen.beginPath();
   if (truth.kind === "tree") pen.arc(px, py, radius, 0, TURN);
-  else { // other things are diamonds: never colour only
-    pen.moveTo(px, py - 5);
-    for (const [dx, dy] of [[5, 0], [0, 5], [-5, 0], [0, -5]]) pen.lineTo(px + dx, py + dy);
+  else { // other things are diamonds with the letter of their class: never colour only
+    pen.moveTo(px, py - DIAMOND);
+    for (const [dx, dy] of [[DIAMOND, 0], [0, DIAMOND], [-DIAMOND, 0], [0, -DIAMOND]]) pen.lineTo(px + dx, py + dy);
   }
   pen.stroke();
+  if (truth.kind !== "tree") drawText(pen, verdictOf(truth.kind)[0], px, py + 3.5, { font: "700 10px", margin: 2 });
+}
+
+// Things of the map to which a repair gave another class than tree: {x, y, kind}. Of several classes of one place the last holds.
+export function classedThings({ annotations }) {
+  const found = new Map();
+  for (const { kind, places, value } of annotations?.others?.repair ?? []) {
+    if (kind === "class") found.set(places[0].map((each) => each.toFixed(2)).join(), { x: places[0][0], y: places[0][1], kind: value, dbh_cm: null });
+  }
+  return [...found.values()].filter(({ kind }) => kind !== "tree");
 }
 
 // The previous map, or a preview of the next one: dashed circles for its trees, and a ring around each difference.

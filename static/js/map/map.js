@@ -11,10 +11,11 @@ import { select, selectCluster } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { clusters, isDrive, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
+import { verdictOf } from "../core/verdicts.js";
 import { openStory } from "../explain/story.js";
 import { drawRepairs, repairClick, repairHover, tool } from "../repair/repairs.js";
 import { ofExtensions } from "../shell/extensions.js";
-import { drawMap, treeAt } from "./draw.js";
+import { classedThings, drawMap, treeAt } from "./draw.js";
 import { boundsOf, MapCanvas } from "./map_canvas.js";
 import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
 
@@ -67,6 +68,7 @@ const clusterAt = (at) => nearest(clusters(), gapTo(at), POINT_REACH);
 const truthAt = (at) => nearest(state.truth ?? [], gapTo(at), POINT_REACH);
 
 const SAME = 0.01; // [m] between an annotation and its copy in the ground truth
+const isAnnotation = (truth) => annotations().some((row) => distance(row, truth) < SAME);
 
 function describe(at) {
   let [tree, truth] = [treeAt(trees(), at, map.view), truthAt(at)];
@@ -82,7 +84,7 @@ function describe(at) {
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, `at ${placeText([tree.x, tree.y])}`, isDrive() ? seenText(tree) : `height ${heightText(tree)}`);
   else if (cluster) lines.push(`${isDrive() ? "Cluster" : "Candidate"}: ${cluster.verdict === "tree" && isDrive() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
-  if (truth) lines.push(`${annotations().some((row) => distance(row, truth) < SAME) ? "Annotation" : "Ground truth"}: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
+  if (truth) lines.push(`${isAnnotation(truth) ? "Annotation" : "Ground truth"}: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
   return lines.join("\n") || NONE;
 }
 
@@ -104,10 +106,13 @@ const isRejected = (tree) => reviewOf(tree) === "rejected";
 
 // The legend names what the map shows.
 function showLegend() {
-  const kinds = (state.truth ?? []).map(({ kind }) => kind);
-  const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"),
+  const truth = state.truth ?? [], others = [...truth.filter(({ kind }) => kind !== "tree"), ...classedThings(state)];
+  const marked = truth.filter(({ kind }) => kind === "tree"), byPeople = marked.some(isAnnotation), ofRun = marked.some((tree) => !isAnnotation(tree));
+  const shown = { truth: marked.length, other: others.length,
     hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
+  setText(byId("legend-truth"), byPeople ? `${ofRun ? "true or " : ""}annotated tree` : "true tree");
+  setText(byId("legend-other"), [...new Set(others.map(({ kind }) => `${verdictOf(kind)[0]} ${kind}`))].sort().join(", "));
   setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");
 }
 
