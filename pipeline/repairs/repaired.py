@@ -264,14 +264,18 @@ def _with_separated(trees: Trees, stems: Sequence[tuple[int, Float, Int]], stamp
 
 def _moved_frame(frame: Frame, trees: Trees, correction: PathCorrection) -> Frame:
     """Return the results with a corrected path: the pose with its particles, the columns and the terrain;
-    `trees` are corrected already."""
+    `trees` are corrected already. A doubt about the pose is said to be of the map before the repairs, since
+    its quality is not determined again."""
+    estimate, health = frame.estimate, frame.health
+    if health.reason:
+        estimate = replace(estimate, health=replace(health, reason=f"before the repairs: {health.reason}"))
     before, after = correction.before[-1], correction.after[-1]
     turn = float(wrap_angle(after[2] - before[2]))
     move = Pose2(*after.tolist()) @ Pose2(*before.tolist()).inverse()
     return replace(
         frame,
         trees=trees,
-        estimate=_moved_estimate(frame.estimate, move, turn),
+        estimate=_moved_estimate(estimate, move, turn),
         columns=None if frame.columns is None else _moved_columns(frame.columns, correction),
         ground=None if frame.ground is None else _moved_ground(frame.ground, correction),
     )

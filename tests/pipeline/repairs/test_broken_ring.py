@@ -115,6 +115,16 @@ def test_ten_repairs_mend_a_broken_ring(seed):
     assert np.count_nonzero(apart.min(axis=1) < 1.0) <= 4, "only the twins and their neighbours"
 
 
+def test_a_doubt_about_the_pose_is_said_to_be_of_the_map_before_the_tie():
+    of, person = run(1)[0], repaired(1)
+    assert of.frame.health.reason.startswith("the position is uncertain by")
+    tie, *others = person.repairs
+    tied = Repairer().repaired(of, [tie]).frame.health
+    assert tied.state == of.frame.health.state
+    assert tied.reason == f"before the repairs: {of.frame.health.reason}"
+    assert Repairer().repaired(of, others[:2]).frame.health == of.frame.health
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_repairs_hold_after_the_run_was_mapped_again(seed):
     again, truth = run(seed, slam__particles=30)
