@@ -92,8 +92,9 @@ def test_a_notice_covers_no_button(dashboard: Dashboard):
             assert page.evaluate(COVERED, "#notice") == [], f"{name}, {width} px"
     page.evaluate(SILENT)
     health = page.locator("[data-figure=health]")
-    expect(health.locator("dd span")).to_have_text("no data for 12 s")
-    expect(health).to_have_class("warn long")  # and not the quality of the last pose
+    expect(health.locator("dd span")).to_have_text("no data")
+    expect(health.locator("dt")).to_have_text("SLAM: for 12 s")
+    expect(health).to_have_class("warn")  # and not the quality of the last pose
     page.evaluate(REAL_STATUS)
 
 

@@ -69,7 +69,7 @@ let held = { state: "good", reason: "", source: "", at: -Infinity };
 
 function health({ health: word, state: phase, source }) {
   const silence = state.connected ? (isOld() ? noData(state.heardAt) : NO_DATA.test(word) && word) : state.lostAt && noData(state.lostAt);
-  if (silence) return [silence, "warn long", "SLAM health"];
+  if (silence) return ["no data", "warn", silence.replace("no data", "SLAM:")];
   const known = state.map?.health;
   const now = { state: word, reason: known?.state === word ? known.reason : "", source, at: performance.now() };
   const isWorse = TESTED.includes(word) && TESTED.indexOf(held.state) > TESTED.indexOf(word);

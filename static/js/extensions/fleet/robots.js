@@ -70,7 +70,7 @@ function repaint() {
 const WORDS = { starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed" };
 const FIGURES = {
   trees: ["trees", (m) => [String(m.trees)]],
-  health: ["SLAM", (m) => [m.health ?? NONE, { good: "good", weak: "warn", lost: "bad" }[m.health] ?? (m.health?.startsWith("no data") ? "warn" : "soon")]],
+  health: ["SLAM", (m) => (m.health?.startsWith("no data") ? ["no data", "warn"] : [m.health ?? NONE, { good: "good", weak: "warn", lost: "bad" }[m.health] ?? "soon"])],
   rate: ["Hz", (m) => [m.state === "playing" ? figure(m.rate_hz) : NONE]],
   behind: ["behind", (m) => [m.behind === null ? NONE : String(m.behind), m.behind > 20 ? "warn" : ""]],
   driven: ["m driven", (m) => [figure(m.distance_m)]],
