@@ -533,6 +533,7 @@ def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str)
     robot = SimpleNamespace(
         waiting_for=lambda: "Nothing heard for 3 s",
         scans_waiting=waiting,
+        silence_s=3.0,
         robot="a",
         robots=["a"],
         recording="",
