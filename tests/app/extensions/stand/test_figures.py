@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from app.extensions.stand.figures import PlotTrees, combined, stand_figures
 from app.extensions.stand.parameters import Stand
 
-
 INDEPENDENT = Stand(dbh_shared_sigma=0.0)
 
 
