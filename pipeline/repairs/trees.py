@@ -43,9 +43,7 @@ def repaired_trees(trees: Trees, repair: Repair, added: int) -> tuple[Trees, str
         case "split":
             return _split(trees, row, np.array(repair.places[1]), added), ""
         case "move":
-            position = trees.position.copy()
-            position[row] = repair.places[1]
-            return replace(trees, position=position), ""
+            return _placed(trees, row, np.array(repair.places[1])), ""
         case "class":
             confirmed = trees.confirmed.copy()
             confirmed[[row] if becomes_tree else _at_one_place(trees, row)] = becomes_tree
@@ -134,13 +132,20 @@ def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:
 def _split(trees: Trees, row: int, place: Float, number: int) -> Trees:
     """Return the trees with a copy of a row at a position and with another number. The diameters of both are
     unknown, because that of the row was fitted to both stems."""
-    table = rows_of(trees, np.append(np.arange(len(trees.number)), row))
+    table = _placed(rows_of(trees, np.append(np.arange(len(trees.number)), row)), -1, place)
     both = [row, len(trees.number)]
-    numbers, position = table.number.copy(), table.position.copy()
-    dbh, dbh_sigma = table.dbh.copy(), table.dbh_sigma.copy()
-    numbers[-1], position[-1] = number, place
+    numbers, dbh, dbh_sigma = table.number.copy(), table.dbh.copy(), table.dbh_sigma.copy()
+    numbers[-1] = number
     dbh[both] = dbh_sigma[both] = np.nan
-    return replace(table, number=numbers, position=position, dbh=dbh, dbh_sigma=dbh_sigma)
+    return replace(table, number=numbers, dbh=dbh, dbh_sigma=dbh_sigma)
+
+
+def _placed(trees: Trees, row: int, place: Float) -> Trees:
+    """Return the trees with a row at a position that a person gave: no scan detected the stem there, so that
+    its standard deviation counts as assumed."""
+    position, observations = trees.position.copy(), trees.observations.copy()
+    position[row], observations[row] = place, 0
+    return replace(trees, position=position, observations=observations)
 
 
 def _consensus(a: Float, sigma_a: Float, b: Float, sigma_b: Float) -> tuple[Float, Float]:

@@ -66,6 +66,11 @@ def test_a_merged_tree_has_no_more_scans_than_the_union_of_both():
     assert repaired("merge", (0.0, 0.0), (9.0, 1.0), of=apart).observations[0] == 4
 
 
+def test_a_position_by_a_person_has_no_scans_so_that_its_sigma_counts_as_assumed():
+    assert repaired("move", (0.0, 0.0), (0.4, 0.0)).observations.tolist() == [0, 9, 9]
+    assert repaired("split", (0.0, 0.0), (0.4, 0.0)).observations.tolist() == [9, 9, 9, 0]
+
+
 @pytest.mark.parametrize(("a", "b"), [((23.1, 1.3), (14.5, 1.1)), ((30.0, 0.2), (20.0, 3.0))])
 def test_the_mean_of_contradicting_diameters_covers_both(a: tuple[float, float], b: tuple[float, float]):
     dbh, sigma = np.array([a, b, (np.nan, np.nan)]).T / 100.0
