@@ -350,7 +350,7 @@ def carried_by(
     }
     for repair in (repair for repair in repairs if not repair.is_of_loop):
         numbers, before = numbers_of(trees, repair), _places(trees)
-        trees, problem = repaired_trees(trees, repair, int(trees.number.max(initial=0)) + 1)
+        trees, problem = repaired_trees(trees, repair)
         if problem or not numbers:
             continue
         after, merged = _places(trees), repair.kind == "merge"

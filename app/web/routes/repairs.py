@@ -112,7 +112,7 @@ def _carried(dashboard: Dashboard, repairs: Sequence[Repair]) -> list[tuple[int,
     editor, trees = dashboard.annotation_editor, dashboard.shown.frame.trees
     for repair in editor.repairs:
         if repair not in dashboard.shown.repairs and not repair.is_of_loop:
-            trees, _ = repaired_trees(trees, repair, int(trees.number.max(initial=0)) + 1)
+            trees, _ = repaired_trees(trees, repair)
     return carried_by(trees, [*editor.rows, *editor.skipped], repairs)
 
 

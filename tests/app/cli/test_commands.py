@@ -62,7 +62,8 @@ def test_a_second_source_is_refused_with_what_to_do(capsys):
     stemmap(capsys, "info", RUN, "sim:stand").refused(
         2, "stemmap info takes one SOURCE, and sim:stand is one more", "Call it again for sim:stand."
     )
-    stemmap(capsys, "merge", "a", "b", "c", "--out", "d").refused(2, "takes one DIR_A and one DIR_B, and c is one more")
+    told = stemmap(capsys, "merge", "a", "b", "c", "--out", "d")
+    told.refused(2, "takes one DIR_A and one DIR_B, and c is one more")
 
 
 def test_compilation_is_reported_once_and_then_its_progress(capsys, monkeypatch):

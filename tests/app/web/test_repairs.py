@@ -121,7 +121,7 @@ async def test_merged_trees_keep_one_annotation_which_is_removed_with_the_merge(
         before = [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)]
         shown = dashboard.shown
         merge = Repair("merge", places=(tuple(a), tuple(b)))
-        merged, _ = repaired_trees(shown.frame.trees, merge, 0)  # type: ignore[union-attr]
+        merged, _ = repaired_trees(shown.frame.trees, merge)  # type: ignore[union-attr]
         assert (await repair(client, kind="merge", places=[a, b])).status_code == 201
         (row,) = await trees_of(client)
         assert (row["x"], row["y"]) == pytest.approx(tuple(merged.position[0]), abs=1e-3)
