@@ -26,7 +26,7 @@ export function clusterStory(story) {
   const known = circlesOf(stem), breast = known.length ? known.reduce((a, b) => (Math.abs(a.height - BREAST) < Math.abs(b.height - BREAST) ? a : b)) : null;
   return [verdict(story, why(story, known.length)),
     gatheredFigure({ points: stem.around, dbh: breast && Math.abs(breast.height - BREAST) < 0.3 ? 2 * breast.radius : null }, "Points of the cloud around it", "no circle is fitted there"),
-    candidateFigures(stem, known), sectionsFigure(stem.sections), checks(story),
+    candidateFigures(stem, known), known.length ? sectionsFigure(stem.sections) : "", checks(story),
     el("figure", {}, el("figcaption", { text: "Votes of the decision trees" }), ...voteNodes(stem.votes))];
 }
 
