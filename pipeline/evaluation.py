@@ -7,6 +7,7 @@ path it is the absolute trajectory error (ATE).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,6 +88,8 @@ class MapScores:
             known in the map and in the ground truth.
         mean_pair_error_percent, largest_pair_error_percent: See `PairErrors`, for the matched trees.
         reach: Maximum distance between the path and an object of the ground truth that counts.
+        beyond: Number of trees and other objects of the ground truth that are farther from the path.
+        dbh_ratio: Median DBH of the trees of `dbh_count` in the ground truth, divided by that in the map.
     """
 
     TA: Rate
@@ -105,6 +108,18 @@ class MapScores:
     mean_pair_error_percent: float | None
     largest_pair_error_percent: float | None
     reach: float
+    beyond: int = 0
+    dbh_ratio: float | None = None
+
+    @property
+    def dbh_factor(self) -> float:
+        """How many times too large the diameters of the ground truth are, if their unit is probably wrong: a
+        power of ten up to 1000, or down to 0.001. 1 if it is not, or with fewer than four diameters. Errors
+        of a diameter do not reach a factor of five in the median."""
+        if self.dbh_ratio is None or self.dbh_count < _DOUBTFUL_TREES or self.dbh_ratio <= 0.0:
+            return 1.0
+        exponent = math.log10(self.dbh_ratio)
+        return float(10.0 ** round(exponent)) if 0.7 < abs(exponent) < 3.5 else 1.0
 
     @property
     def is_doubtful(self) -> bool:
@@ -131,9 +146,8 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
     found = trees.position[confirmed]
     position = np.stack([truth.x, truth.y], axis=1)
     is_tree = np.array([kind == "tree" for kind in truth.kind], np.bool_)
-    in_reach = _within(position, path, parameters.reach) & np.array(
-        [k != HIDDEN for k in truth.kind], np.bool_
-    )
+    counts = np.array([k != HIDDEN for k in truth.kind], np.bool_)
+    in_reach = _within(position, path, parameters.reach) & counts
     truth_of = match(found, position, parameters.match_distance)
     matched = truth_of >= 0
     hit = np.zeros(len(position), np.bool_)
@@ -146,8 +160,9 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
     completeness = Rate(_count(hit & in_reach & is_tree), _count(in_reach & is_tree))
     correctness = Rate(_count(right), _count(counted)).rate
     offset = found[right] - position[truth_of[right]]
-    dbh_error = trees.dbh[confirmed][right] - truth.dbh[truth_of[right]]
-    dbh_error = dbh_error[np.isfinite(dbh_error)]
+    dbh = np.stack([trees.dbh[confirmed][right], truth.dbh[truth_of[right]]])
+    dbh = dbh[:, np.isfinite(dbh).all(axis=0)]
+    dbh_error = dbh[0] - dbh[1]
     pairs = pair_errors(found[right], position[truth_of[right]])
     return MapScores(
         TA=completeness,
@@ -166,6 +181,8 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
         mean_pair_error_percent=_none(pairs.mean),
         largest_pair_error_percent=_none(pairs.largest),
         reach=parameters.reach,
+        beyond=_count(counts & ~in_reach),
+        dbh_ratio=float(np.median(dbh[1]) / np.median(dbh[0])) if len(dbh_error) else None,
     )
 
 

@@ -73,7 +73,8 @@ TREE_FIELDS = (
         "observations",
         "obs",
         "",
-        "number of scans, or of sections of a whole cloud, with a detection of the tree",
+        "number of scans, or of sections of a whole cloud, with a detection of the tree; 0: the position is "
+        "that of the accumulated scans or of a person, and its standard deviation assumed",
     ),
     Field("coverage_deg", "cover_deg", "deg", "part of the circumference that was observed"),
     Field(

@@ -26,6 +26,7 @@ from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED
 from pipeline.io.result_files import (
     PATH_COLUMNS,
+    READ_TREE_COLUMNS,
     REJECTED,
     REVIEWS,
     SEEN_COLUMNS,
@@ -92,7 +93,7 @@ def read_run(folder: FilePath) -> FinishedRun:
         uri, seed = str(record["source"]["uri"]), int(record["seed"])
     except (ValueError, KeyError, TypeError, OverflowError, ParameterError):
         raise damaged_record(folder) from None
-    columns = _columns(folder / "trees.csv", TREE_COLUMNS)
+    columns = _columns(folder / "trees.csv", READ_TREE_COLUMNS)
     states = [REVIEWS[k] for k in np.nan_to_num(columns["review"]).astype(np.int64)]
     trees = rows_of(_trees(columns), kept := np.array([state != REJECTED for state in states], np.bool_))
     return FinishedRun(
@@ -115,7 +116,7 @@ def read_tree_places(folder: FilePath) -> dict[int, tuple[float, float]]:
     Raises:
         SourceError: The file is missing or damaged.
     """
-    c = _columns(folder / "trees.csv", TREE_COLUMNS)
+    c = _columns(folder / "trees.csv", READ_TREE_COLUMNS)
     numbers = c["tree"].astype(np.int64).tolist()
     return dict(zip(numbers, zip(c["x_m"].tolist(), c["y_m"].tolist(), strict=True), strict=True))
 
@@ -282,7 +283,7 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
 
     Args:
         file: The file.
-        names: The expected header.
+        names: Names that the header must have; further columns are not read.
 
     Raises:
         SourceError: The file cannot be read or is larger than 256 MB, has another header or a damaged row, or
@@ -296,10 +297,13 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
         rows = list(csv.reader(text.splitlines()))
     except (csv.Error, ValueError):
         raise damaged from None
-    if not rows or tuple(rows[0]) != names:
+    if not rows or not set(names) <= set(rows[0]):
         raise SourceError(f"the columns are not {', '.join(names)}", where=str(file))
+    order = [rows[0].index(name) for name in names]
     try:
-        columns = _table(rows[1:], names)
+        if any(len(row) != len(rows[0]) for row in rows):
+            raise ValueError("a row is too short")
+        columns = _table([[row[k] for k in order] for row in rows[1:]], names)
     except ValueError:
         raise damaged from None
     for name in _NEVER_EMPTY.intersection(names):

@@ -365,27 +365,42 @@ def evaluation_lines(e: MapScores, *, whole: bool = False) -> list[str]:
         whole: Whether all true trees count, as without a drive.
     """
     where = "in the whole plot" if whole else f"within {e.reach:g} m of the path"
+    beyond = count(e.beyond, "object of the ground truth is", "objects of the ground truth are")
+    doubt = truth_in_doubt(e)
     return [
         f"trees found (TA) {rate_text(e.TA)}, missed (FR) {rate_text(e.FR)} {where}",
+        *([f"not counted: {beyond} farther from the path (evaluation.reach)"] if e.beyond else []),
         f"other objects left out (TR) {rate_text(e.TR)}, mapped as trees (FA) {rate_text(e.FA)}; "
         f"{count(e.spurious, 'spurious tree')}",
         f"completeness {_percent(e.completeness)}   correctness {_percent(e.correctness)}   "
         f"F1 {_percent(e.f1)}",
         f"position RMSE {_metres(e.position_rmse)}   DBH RMSE {_metres(e.dbh_rmse)} "
         f"({count(e.dbh_count, 'tree')})   mean pair error {_pair(e.mean_pair_error_percent)}",
-        *([f"warning: {truth_in_doubt(e)}"] if e.is_doubtful else []),
+        *([f"warning: {doubt}"] if doubt else []),
     ]
 
 
 def truth_in_doubt(e: MapScores) -> str:
-    """Return a warning that the ground truth may belong to another forest; "" unless `e.is_doubtful`."""
+    """Return a warning that the ground truth may belong to another forest, or that the unit of its diameters
+    is wrong; "" if neither is in doubt, see `MapScores`."""
     if not e.is_doubtful:
-        return ""
+        return _unit_in_doubt(e.dbh_factor)
     few = f"only {e.TA.count}" if e.TA.count else "none"
     verb = "is" if e.TA.count <= 1 else "are"
     return (
         f"{few} of {count(e.TA.of, 'true tree')} {verb} near a mapped one: is this the ground truth of this "
         "forest, in the frame of the map?"
+    )
+
+
+def _unit_in_doubt(factor: float) -> str:
+    """Return a warning that diameters are `factor` times too large; "" for 1."""
+    if factor == 1.0:
+        return ""
+    times = f"{factor:g} times" if factor > 1.0 else f"1/{1.0 / factor:g} of"
+    return (
+        f"the diameters of the ground truth are about {times} those of the map: is their unit right? The "
+        "name of their column states it (dbh_mm, dbh_cm, dbh_m), or --dbh-unit for a column dbh"
     )
 
 

@@ -144,8 +144,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:
-    """Report unknown words of a command, with the flag nearest to the first of them as remedy,
-    or an extension with flags of the command that is switched off.
+    """Report unknown words of a command: a further source or file as such, a flag with the nearest one as
+    remedy, or an extension with flags of the command that is switched off.
 
     Args:
         unknown: The words, at least one.
@@ -155,6 +155,13 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
     Raises:
         UsageError: Always.
     """
+    taken = [str(action.metavar) for action in parser._actions if not action.option_strings]
+    if taken and not unknown[0].startswith("-"):
+        again = f"Call it again for {unknown[0]}. " if len(taken) == 1 else ""
+        raise UsageError(
+            f"stemmap {command} takes one {' and one '.join(taken)}, and {unknown[0]} is one more",
+            remedy=f"{again}See stemmap {command} --help",
+        )
     flags = [flag for action in parser._actions for flag in action.option_strings]
     near = difflib.get_close_matches(unknown[0].split("=")[0], flags, n=1, cutoff=0.6)
     off = [

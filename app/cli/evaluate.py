@@ -43,30 +43,36 @@ def run(arguments: argparse.Namespace) -> int:
     scored. `arguments` gets `files`, see `truth_files`.
 
     Returns:
-        Exit code: 0; 3 if some runs could not be scored; 1 if none could.
+        Exit code: 0; 3 if some runs could not be scored or the ground truth of one is in doubt; 1 if none
+        could be scored.
 
     Raises:
         StemmapError: The arguments contradict each other, or a single run cannot be scored.
     """
+    from app.batch.summary import evaluation_lines, truth_in_doubt
+
     arguments.files = truth_files(arguments)
-    if len(arguments.runs) == 1:
-        return _print(arguments, *_score(arguments, 0))
-    failed, plains = 0, {}
+    several = len(arguments.runs) > 1
+    failed, plains, doubts = 0, {}, []
     for number, name in enumerate(arguments.runs):
         try:
             evaluation, whole = _score(arguments, number)
-        except StemmapError as error:  # the other runs are scored all the same
+        except StemmapError as error:
+            if not several:
+                raise
             print(f"stemmap: {flags.plain(name)}: {error}", file=sys.stderr)
             failed += 1
             continue
-        if arguments.json:
-            plains[name] = asdict(evaluation)
-            continue
-        print(f"{flags.plain(name)}:")
-        _print(arguments, evaluation, whole)
+        plains[name] = asdict(evaluation)
+        if doubt := truth_in_doubt(evaluation):
+            doubts.append(f"{name}: {doubt}" if several else doubt)
+        if not arguments.json:
+            lines = evaluation_lines(evaluation, whole=whole)
+            print("\n".join([f"{flags.plain(name)}:", *lines] if several else lines))
     if arguments.json:
-        print(json.dumps(plains, indent=1))
-    return 0 if not failed else 1 if failed == len(arguments.runs) else 3
+        print(json.dumps(plains if several else plains[arguments.runs[0]], indent=1))
+        flags.print_warnings(doubts)
+    return 1 if failed == len(arguments.runs) else 3 if failed or doubts else 0
 
 
 def truth_files(arguments: argparse.Namespace) -> dict[str, str]:
@@ -77,24 +83,6 @@ def truth_files(arguments: argparse.Namespace) -> dict[str, str]:
     )
     truths = arguments.truths * len(arguments.runs) if one_for_all else arguments.truths
     return flags.files_of(arguments.runs, truths)
-
-
-def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) -> int:
-    """Print the scores of a run as lines or, with --json, as JSON; return 0.
-
-    Args:
-        arguments: Arguments of the command.
-        evaluation: The scores.
-        whole: Whether all true trees count, as without a drive.
-    """
-    from app.batch.summary import evaluation_lines
-
-    if arguments.json:
-        print(json.dumps(asdict(evaluation), indent=1))
-    else:
-        for line in evaluation_lines(evaluation, whole=whole):
-            print(line)
-    return 0
 
 
 def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]:

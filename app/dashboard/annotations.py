@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -21,6 +22,7 @@ from app.store.records import (
     REPAIR,
     SKIPPED,
     Annotation,
+    Author,
     Changed,
     Content,
     StaleError,
@@ -180,6 +182,7 @@ class AnnotationEditor:
         self.changed: Callable[[], None] = lambda: None
         self.edited: Callable[[str, int], None] = lambda _who, _number: None
         self._store = store
+        self._awaited: list[tuple[int, Author, Repair, Trees, tuple[int, ...]]] = []
         self._generation = 0  # grows whenever another run is opened or the run is left
 
     async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
@@ -218,6 +221,7 @@ class AnnotationEditor:
         not change, and `changed` is not called."""
         self._generation += 1
         self.run, self._own, self.against = None, None, "both"
+        self._awaited = []
         self._show([])
 
     def _show(self, stored: Sequence[Annotation]) -> None:
@@ -244,6 +248,44 @@ class AnnotationEditor:
         """The repairs of the map, in the order in which they were made."""
         rows = sorted((row for row in self.others if row.content.kind == REPAIR), key=lambda row: row.id)
         return tuple(msgspec.convert(row.content.values, Repair) for row in rows)
+
+    def await_map(
+        self, id_: int, author: Author, repair: Repair, trees: Trees, pair: tuple[int, ...]
+    ) -> None:
+        """Let the annotations follow the trees once the map has a repair of the path, see `follow`.
+
+        Args:
+            id_: Number of the annotation of the repair.
+            author: Author of the repair.
+            repair: The repair.
+            trees: The trees before it.
+            pair: Numbers of the trees that it ties.
+        """
+        self._awaited.append((id_, author, repair, trees, pair))
+
+    async def follow(self, repairs: Sequence[Repair], trees: Trees) -> None:
+        """Move the annotations of trees that awaited repairs of the path have moved, in the steps in which
+        these were added. Errors are logged.
+
+        Args:
+            repairs: The repairs of a new map; awaited ones that are not among them stay awaited, unless they
+                were removed.
+            trees: Its trees.
+        """
+        if not self._awaited:
+            return
+        known = self.repairs
+        there = [each for each in self._awaited if each[2] in repairs]
+        self._awaited = [each for each in self._awaited if each not in there and each[2] in known]
+        for id_, author, repair, before, pair in there:
+            run = self.run
+            moved = carried_along(before, trees, pair, [*self.rows, *self.skipped])
+            if run is None or not moved or repair not in known:
+                continue
+            try:
+                await self.edit(run, methodcaller("change_with", run, author, id_, moved))
+            except StemmapError as error:
+                _log.warning("the annotations do not follow the repair: %s", error)
 
     async def edit(self, run: int, function: Callable[[Store], T]) -> T:
         """Run an edit in the thread of the store, update the annotations, call `changed` (and `edited` if any
@@ -350,7 +392,7 @@ def carried_by(
     }
     for repair in (repair for repair in repairs if not repair.is_of_loop):
         numbers, before = numbers_of(trees, repair), _places(trees)
-        trees, problem = repaired_trees(trees, repair, int(trees.number.max(initial=0)) + 1)
+        trees, problem = repaired_trees(trees, repair)
         if problem or not numbers:
             continue
         after, merged = _places(trees), repair.kind == "merge"
@@ -366,6 +408,63 @@ def carried_by(
             if repair.kind == "split":
                 tree_of[id_] = next(iter(numbers_at(trees, [(x, y)], confirmed=True)), stays)
     return [(row.id, row.version, contents[row.id]) for row in rows if contents[row.id] != row.content]
+
+
+def carried_along(
+    before: Trees, after: Trees, pair: Sequence[int], rows: Sequence[Annotation]
+) -> list[tuple[int, int, Content | None]]:
+    """Return the changes of the annotations of trees that a repair of the path moves or merges, as
+    `carried_by`.
+
+    Args:
+        before, after, pair: As in `_successors`.
+        rows: The annotations of objects and skipped trees.
+    """
+    contents: dict[int, Content | None] = {row.id: row.content for row in rows}
+    tree_of = {
+        row.id: number
+        for row in rows
+        for number in numbers_at(before, [(row.content.x, row.content.y)], confirmed=True)
+    }
+    old, new = _places(before), _places(after)
+    stays = _successors(before, after, pair)
+    for number, other in stays.items():
+        if other != number and other in old:
+            contents |= _merged_contents(contents, tree_of, old, (other, number))
+    for id_, number in tree_of.items():
+        content, at = contents[id_], stays.get(number)
+        if content is not None and at is not None:
+            x, y = (new[at] - old[number]).tolist()
+            contents[id_] = replace(content, x=content.x + x, y=content.y + y)
+    return [(row.id, row.version, contents[row.id]) for row in rows if contents[row.id] != row.content]
+
+
+def _successors(before: Trees, after: Trees, pair: Sequence[int]) -> dict[int, int]:
+    """Return the number after a repair of the path by the number of each tree that is known there: its own,
+    or that of the tree with which it was merged.
+
+    A repair moves what was seen at one time together. A merged tree is therefore the one that stands where it
+    comes to with the known tree that was first seen next to it, from the time of the tied stem outwards.
+
+    Args:
+        before, after: The trees before and after the repair.
+        pair: Numbers of the two tied stems; others are not known to be one.
+    """
+    old, new = _places(before), _places(after)
+    first = dict(zip(before.number.tolist(), before.first_seen_ns.tolist(), strict=True))
+    same = {number: number for number in old if number in new}
+    stays, gone = [n for n in pair if n in new], [n for n in pair if n in old and n not in new]
+    if len(stays) == len(gone) == 1:
+        same[gone[0]] = stays[0]
+    begin = first[gone[0]] if gone else 0
+    for number in sorted(old.keys() - same.keys(), key=lambda n: abs(first[n] - begin)):
+        if not same:
+            break
+        near = min(same, key=lambda n: abs(first[n] - first[number]))
+        x, y = (old[number] + new[same[near]] - old[near]).tolist()
+        if found := numbers_at(after, [(x, y)], confirmed=True):
+            same[number] = found[0]
+    return same
 
 
 def _places(trees: Trees) -> dict[int, Float]:
@@ -414,7 +513,8 @@ def carried_back(repair: Repair, changes: Sequence[Changed]) -> list[tuple[int, 
     back = list[tuple[int, int, Content | None]]()
     for row, before, after in changes:
         # A tree is within GATE of its place in the repair, and an annotation within GATE of its tree.
-        if all(math.hypot(before.x - x, before.y - y) > 2.0 * GATE for x, y in repair.places):
+        near = any(math.hypot(before.x - x, before.y - y) <= 2.0 * GATE for x, y in repair.places)
+        if not near and not repair.is_of_loop:  # a repair of the path moves trees everywhere
             continue
         now = row.content
         content = before

@@ -485,6 +485,9 @@ class Dashboard:
             frame = replace(shown.frame, ground=self.shown.frame.ground)
             shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
+        await self.annotation_editor.follow(shown.repairs, shown.frame.trees)
+        if number != self._opens:
+            return
         distance = self.parameters.parameters.evaluation.match_distance
         payload = await asyncio.to_thread(map_payload, shown, self.truth, distance)
         if number != self._opens:  # another source was requested meanwhile

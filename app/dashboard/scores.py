@@ -99,6 +99,7 @@ def score_payload(score: MapScores) -> dict[str, Any]:
         "mean_pair_error_percent": score.mean_pair_error_percent,
         "largest_pair_error_percent": score.largest_pair_error_percent,
         "reach_m": score.reach,
+        "beyond": score.beyond,
         "warning": truth_in_doubt(score),
     }
 

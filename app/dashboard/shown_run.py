@@ -23,6 +23,7 @@ from app.sources.request import SourceRequest
 from app.store.records import Annotation
 from app.worker.protocol import Shown, Status
 from pipeline.config import Parameters
+from pipeline.geometry.poses import Pose2
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import (
     PATH_COLUMNS,
@@ -122,9 +123,16 @@ class ShownRun:
 
     def trees_text(self) -> str:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
-        coordinates of the files."""
+        coordinates of the files; with a reference system also their `easting_m` and `northing_m` in it."""
         trees = in_file(self.shown.frame.trees, self.one_step)
-        return self._in_units(csv_text(TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())))
+        names, rows = TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())
+        if self.frame is not None and self.frame.content.values is not None:
+            given = self.frame.content.values["frame"]
+            pose = Pose2(given["east_m"], given["north_m"], given["turn_rad"])
+            names = (*names, "easting_m", "northing_m")
+            place = pose.apply(trees.position[trees.confirmed]).tolist()
+            rows = [(*row, *(number_text(v, 3) for v in at)) for row, at in zip(rows, place, strict=True)]
+        return self._in_units(csv_text(names, rows))
 
     def _in_units(self, text: str) -> str:
         """Return a CSV text with positions in the units of the reference system of the file."""

@@ -328,16 +328,28 @@ _MOST_CELLS = 20_000  # 160 kB
 
 
 def points_around(voxels: VoxelMap, place: NDArray[np.float64]) -> list[tuple[float, float, float]]:
-    """Return the voxels within a horizontal distance of REACH of a position as tuples of x, y relative to the
-    position and height above the ground [m], rounded to 1 cm: first at most 600 at breast height (see
-    `_at_breast`), then at most 900 others.
+    """Return the voxels around a position, see `nearest_points`.
 
     Args:
         voxels: Voxels of all scans.
         place: Position x, y in the map, shape (2,) [m].
     """
     mean, _ = voxels.around(np.floor(place / TILE).astype(np.int64), REACH)
-    points = mean.astype(np.float64) - [*place, 0.0]
+    return nearest_points(mean, place)
+
+
+def nearest_points(
+    points: NDArray[np.floating], place: NDArray[np.float64]
+) -> list[tuple[float, float, float]]:
+    """Return the points within a horizontal distance of REACH of a position as tuples of x, y relative to the
+    position and height above the ground [m], rounded to 1 cm: first at most 600 at breast height (see
+    `_at_breast`), then at most 900 others.
+
+    Args:
+        points: x, y in the map and height above the ground, shape (N, 3) [m].
+        place: Position x, y in the map, shape (2,) [m].
+    """
+    points = points.astype(np.float64) - [*place, 0.0]
     points = points[np.hypot(points[:, 0], points[:, 1]) <= REACH]
     at_breast = _at_breast(points[:, 2])
     chosen = [

@@ -572,6 +572,26 @@ class Store:
                 self._change(connection, step, author, row, content)
             return ids
 
+    def change_with(
+        self, run: int, author: Author, id_: int, changed: Sequence[tuple[int, int, Content | None]]
+    ) -> None:
+        """Change annotations in the step that added another one, so that both are undone together; nothing if
+        that one was deleted since. Other arguments and errors as in `edit`.
+
+        Args:
+            run, author: As in `edit`.
+            id_: Identifier of the annotation that was added.
+            changed: As in `edit`.
+        """
+        added = select(_changes.c.step).where(_changes.c.annotation == id_).order_by(_changes.c.id)
+        with self._engine.begin() as connection:
+            if _row(connection, id_).deleted:
+                return
+            step = connection.execute(added.limit(1)).scalar_one()
+            for each, version, content in changed:
+                row = _to_change(connection, run, each, version, content)
+                self._change(connection, step, author, row, content)
+
     def changed_with(self, id_: int) -> list[Changed]:
         """Return the changes of other annotations in the step that added an annotation. Those that were
         deleted are left out, unless this step has deleted them and they were not changed since.

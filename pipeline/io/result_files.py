@@ -64,8 +64,11 @@ _TREES: dict[str, Callable[[Trees, int], Iterable[str]]] = {
     "height_m": lambda trees, _: _numbers(trees.height, 2),
     "sigma_height_m": lambda trees, _: _numbers(trees.height_sigma, 2),
     "lean_deg": lambda trees, _: _numbers(None if trees.lean is None else np.degrees(trees.lean), 2),
+    "sigma_assumed": lambda trees, _: ("1" if n == 0 else "0" for n in trees.observations),
 }
 TREE_COLUMNS = (*_TREES, "review")
+#: Those that are read back; `sigma_assumed` follows from the observations.
+READ_TREE_COLUMNS = tuple(name for name in TREE_COLUMNS if name != "sigma_assumed")
 _PATH: dict[str, Callable[[Path, int], Iterable[str]]] = {
     "t_s": lambda path, start_ns: _seconds(path.stamp_ns, start_ns),
     "x_m": lambda path, _: _numbers(path.x, 4),

@@ -12,7 +12,7 @@ from pipeline.geometry.pose_arrays import PathCorrection, rotated_rows
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.repairs.loops import LoopRepair, corrected_from, with_loops
 from pipeline.repairs.record import Repair, tied_numbers
-from pipeline.repairs.trees import FIRST_ADDED, merged_trees, numbers_of, repaired_trees
+from pipeline.repairs.trees import merged_trees, number_beside, numbers_of, repaired_trees
 from pipeline.slam.keyframe_graph import TWICE, KeyframeGraph
 from pipeline.types.records import Bool, Columns, Frame, HeightMap, Int, Path, PoseEstimate, Trees
 
@@ -20,8 +20,6 @@ from pipeline.types.records import Bool, Columns, Frame, HeightMap, Int, Path, P
 #: below which it stays where it is.
 OF_STEM, STAYS = 0.5, 0.1
 LEAST_VIEWS = 3  # keyframes that detect a stem, at least, which a wrong path had mixed with another one
-#: Numbers of such trees begin here.
-FIRST_SEPARATED = 200_001
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,14 +98,14 @@ class Repairer:
                 frame = _moved_frame(frame, _moved_trees(run, correction), correction)
         problems, numbers, trees = list[str](), list[tuple[int, ...]](), frame.trees
         agreeing = list[tuple[int, ...]]()
-        for number, repair in enumerate(repairs):
+        for repair in repairs:
             if repair.is_of_loop:
                 problem, agree = next(of_loop)
                 agreeing.append(agree)
                 numbers.append(tied_numbers(run.frame.trees, run.path, repair))
             else:
                 numbers.append(numbers_of(trees, repair))
-                trees, problem = repaired_trees(trees, repair, FIRST_ADDED + number)
+                trees, problem = repaired_trees(trees, repair)
                 agreeing.append(())
             problems.append(problem)
         return RepairedMap(
@@ -161,7 +159,7 @@ def _moved_trees(run: MapOfRun, correction: PathCorrection) -> Trees:
     order = np.argsort(birth, kind="stable")
     names, begin = np.unique(birth[order], return_index=True)
     row_of = {int(b): k for k, b in enumerate(run.landmark.tolist()) if b >= 0}
-    others: list[tuple[int, Float, Int]] = []  # row, mean and scans of a second stem
+    others: list[tuple[int, Float, Int]] = []  # number of the tree, mean and scans of a second stem
     for name, rows in zip(names.tolist(), np.split(order, begin[1:]), strict=True):
         row = row_of.get(name)
         if row is None:
@@ -173,7 +171,7 @@ def _moved_trees(run: MapOfRun, correction: PathCorrection) -> Trees:
         if len(rest) >= LEAST_VIEWS and trees.confirmed[row]:
             second = rest[_most(place[rest])]
             if len(second) >= LEAST_VIEWS:
-                others.append((row, place[second].mean(axis=0), scans[second]))
+                others.append((int(trees.number[row]), place[second].mean(axis=0), scans[second]))
     flat = rotated_rows(trees.covariance[:, [0, 0, 1], [0, 1, 1]], turn)
     covariance = flat[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     moved = replace(trees, position=position, covariance=covariance)
@@ -229,14 +227,16 @@ def _with_separated(trees: Trees, stems: Sequence[tuple[int, Float, Int]], stamp
 
     Args:
         trees: The trees.
-        stems: Position [m] and scans of each further stem, after the row of the tree with which it was mixed.
+        stems: Position [m] and scans of each further stem, after the number of the tree with which it was
+            mixed.
         stamps: Time of each scan [ns].
     """
-    found = list[tuple[Float, Int]]()
+    found, numbers = list[tuple[Float, Int]](), trees.number
     known = trees.position[trees.confirmed]
-    for _, place, scans in stems:
+    for of, place, scans in stems:
         if not len(known) or np.hypot(*(known - place).T).min() > TWICE:
             found.append((place, scans))
+            numbers = np.append(numbers, number_beside(numbers, of))
             known = np.concatenate([known, place[None]])
     if not found:
         return trees
@@ -244,7 +244,7 @@ def _with_separated(trees: Trees, stems: Sequence[tuple[int, Float, Int]], stamp
     table = rows_of(trees, np.append(np.arange(number), np.zeros(len(found), np.int64)))
     nothing = np.full(len(found), np.nan)
     columns = {
-        "number": FIRST_SEPARATED + np.arange(len(found)),
+        "number": numbers[number:],
         "position": np.array([place for place, _ in found]),
         "observations": np.array([len(scans) for _, scans in found]),
         "first_seen_ns": stamps[[scans.min() for _, scans in found]],

@@ -11,18 +11,15 @@ from pipeline.geometry.columns import rows_of
 from pipeline.repairs.record import GATE, Repair, nearest_tree, numbers_at
 from pipeline.types.records import Float, Int, Trees
 
-#: Numbers of trees that a repair adds begin here; no map of scans has so many trees.
-FIRST_ADDED = 100_001
 SIDES = 36  # sectors of `Trees.sides`
 
 
-def repaired_trees(trees: Trees, repair: Repair, added: int) -> tuple[Trees, str]:
+def repaired_trees(trees: Trees, repair: Repair) -> tuple[Trees, str]:
     """Return the trees after a repair of trees, and why it does not apply, "" if it does.
 
     Args:
         trees: The trees; not changed.
         repair: A repair that is not of a loop.
-        added: Number of a tree that a split adds.
     """
     x, y = repair.places[0]
     becomes_tree = repair.value == "tree"
@@ -41,11 +38,9 @@ def repaired_trees(trees: Trees, repair: Repair, added: int) -> tuple[Trees, str
                 return trees, f"both positions are of tree {trees.number[row]}"
             return merged_trees(trees, np.array([row]), np.array([other])), ""
         case "split":
-            return _split(trees, row, np.array(repair.places[1]), added), ""
+            return _split(trees, row, np.array(repair.places[1])), ""
         case "move":
-            position = trees.position.copy()
-            position[row] = repair.places[1]
-            return replace(trees, position=position), ""
+            return _placed(trees, row, np.array(repair.places[1])), ""
         case "class":
             confirmed = trees.confirmed.copy()
             confirmed[[row] if becomes_tree else _at_one_place(trees, row)] = becomes_tree
@@ -131,16 +126,32 @@ def merged_trees(trees: Trees, into: Int, others: Int) -> Trees:
     return rows_of(replace(trees, **changed), np.setdiff1d(np.arange(len(trees.number)), others))
 
 
-def _split(trees: Trees, row: int, place: Float, number: int) -> Trees:
-    """Return the trees with a copy of a row at a position and with another number. The diameters of both are
+def number_beside(numbers: Int, number: int) -> int:
+    """Return the number of a stem that is separated from a tree: 9001, 9002 and so on for tree 9, the first
+    that `numbers` does not have. Numbers that follow the last one would be those of trees to come."""
+    taken, beside = set(numbers.tolist()), 1000 * number + 1
+    while beside in taken:
+        beside += 1
+    return beside
+
+
+def _split(trees: Trees, row: int, place: Float) -> Trees:
+    """Return the trees with a copy of a row at a position, see `number_beside`. The diameters of both are
     unknown, because that of the row was fitted to both stems."""
-    table = rows_of(trees, np.append(np.arange(len(trees.number)), row))
+    table = _placed(rows_of(trees, np.append(np.arange(len(trees.number)), row)), -1, place)
     both = [row, len(trees.number)]
-    numbers, position = table.number.copy(), table.position.copy()
-    dbh, dbh_sigma = table.dbh.copy(), table.dbh_sigma.copy()
-    numbers[-1], position[-1] = number, place
+    numbers, dbh, dbh_sigma = table.number.copy(), table.dbh.copy(), table.dbh_sigma.copy()
+    numbers[-1] = number_beside(trees.number, int(trees.number[row]))
     dbh[both] = dbh_sigma[both] = np.nan
-    return replace(table, number=numbers, position=position, dbh=dbh, dbh_sigma=dbh_sigma)
+    return replace(table, number=numbers, dbh=dbh, dbh_sigma=dbh_sigma)
+
+
+def _placed(trees: Trees, row: int, place: Float) -> Trees:
+    """Return the trees with a row at a position that a person gave: no scan detected the stem there, so that
+    its standard deviation counts as assumed."""
+    position, observations = trees.position.copy(), trees.observations.copy()
+    position[row], observations[row] = place, 0
+    return replace(trees, position=position, observations=observations)
 
 
 def _consensus(a: Float, sigma_a: Float, b: Float, sigma_b: Float) -> tuple[Float, Float]:

@@ -432,11 +432,12 @@ class Trees:
     Attributes:
         number: int64, from 1; a tree never changes its number.
         position: shape (T, 2) [m].
-        covariance: shape (T, 2, 2) [m^2].
+        covariance: shape (T, 2, 2) [m^2]; assumed, not measured, without observations.
         dbh: Diameter at breast height [m], NaN if no arc was wide enough.
         dbh_sigma: Its standard deviation [m], or NaN.
         eccentricity: Mean over the observations.
-        observations: int64, number of scans with a detection of it. The counts of merged trees are added.
+        observations: int64, number of scans with a detection of it. The counts of merged trees are added. 0
+            for a tree of the accumulated scans only, and for one whose position a person gave.
         coverage: Part of its circumference that was observed [rad].
         first_seen_ns, last_seen_ns: int64.
         confirmed: Whether it was observed often enough to be shown and exported.

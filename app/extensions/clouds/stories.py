@@ -5,12 +5,13 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from app.explain.build import check_results
+from app.explain.build import check_results, nearest_points
 from app.explain.records import ClusterStory, TreeStory, half_axes
 from app.extensions.clouds.inventory import PlotMap
 from app.extensions.clouds.inventory.cross_sections import STEP, THICK, slice_heights
 from app.extensions.clouds.inventory.stem_model import stem_checks
 from pipeline.classification.column_extraction import BREAST
+from pipeline.classification.forest import CLASSES
 from pipeline.config import Parameters
 from pipeline.geometry.columns import evenly_spaced
 from pipeline.geometry.poses import Float
@@ -54,6 +55,8 @@ class StemOfCloud(msgspec.Struct, frozen=True):
         height, height_sigma: Height of the tree and its standard deviation [m]; NaN if the top is not seen.
         height_hidden: Reason why the height is unknown; empty if it is known.
         lean_deg: Angle of the stem from the vertical [deg]; NaN if it is not measured.
+        votes: Of a candidate: dict from the label of each class to its share of the votes.
+        around: Of a candidate: points around it, see `nearest_points`.
     """
 
     sections: list[CrossSection]
@@ -61,6 +64,8 @@ class StemOfCloud(msgspec.Struct, frozen=True):
     height_sigma: float = float("nan")
     height_hidden: str = ""
     lean_deg: float = float("nan")
+    votes: dict[str, float] = {}
+    around: list[tuple[float, float, float]] = []
 
 
 def tree_story(plot: PlotMap, frame: Frame, row: int, parameters: Parameters) -> TreeStory:
@@ -106,6 +111,11 @@ def cluster_story(plot: PlotMap, frame: Frame, row: int, parameters: Parameters)
     tree = np.flatnonzero(plot.tree_candidate == row)
     detection = parameters.detection
     checks = stem_checks(plot.stems, plot.share, detection.radius_min, detection.cloud_radius_max)
+    stem = StemOfCloud(
+        cross_sections(plot, row),
+        votes={kind.label: float(share) for kind, share in zip(CLASSES, plot.share[row], strict=True)},
+        around=nearest_points(plot.points[:, [0, 1, 3]], place),
+    )
     return ClusterStory(
         scan=0,
         cluster=row,
@@ -114,7 +124,7 @@ def cluster_story(plot: PlotMap, frame: Frame, row: int, parameters: Parameters)
         size=int(frame.clusters.size[row]),
         position=(float(place[0]), float(place[1])),
         tree=int(frame.trees.number[tree[0]]) if len(tree) else None,
-        extensions={NAME: StemOfCloud(cross_sections(plot, row))},
+        extensions={NAME: stem},
     )
 
 

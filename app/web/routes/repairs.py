@@ -20,7 +20,7 @@ from app.store.records import REPAIR, Content
 from app.store.store import Store
 from app.web.responses import BadRequestError, Number, as_bad_request, text_reply
 from app.web.routes.access import Dash, Edit, Metres, apply_edit, edited
-from pipeline.repairs.record import MOST, Kind, Repair, parse_repairs, repairs_text, seen_from
+from pipeline.repairs.record import MOST, Kind, Repair, numbers_at, parse_repairs, repairs_text, seen_from
 from pipeline.repairs.trees import repaired_trees
 
 router = APIRouter(prefix="/api")
@@ -45,14 +45,19 @@ class _ImportRepairs(Edit):
 
 @router.post("/repairs")
 async def add(body: _AddRepair, dashboard: Dash) -> Response:
-    """Add a repair; the annotations of moved and merged trees follow. Return its number (`id`) and the counts
+    """Add a repair; the annotations of moved and merged trees follow, at a repair of the path once the map
+    has it. Return its number (`id`) and the counts
     of edits, see `edited`, with 201. 409 before the first map or if another run was opened meanwhile, 422 for
     a repair that is not valid, and for a tie of a position without a tree."""
     if len(dashboard.annotation_editor.repairs) >= MOST:
         raise BadRequestError(f"a run can have at most {MOST} repairs")
     repair = _repair(body, dashboard)
-    moved = _carried(dashboard, [repair])
+    moved, shown = _carried(dashboard, [repair]), dashboard.shown
     (added,) = await apply_edit(dashboard, body, Store.edit, [_content(repair)], moved)
+    if repair.is_of_loop and shown is not None:
+        trees, places = shown.frame.trees, [(x, y) for x, y in body.places]
+        pair = numbers_at(trees, places, confirmed=True)
+        dashboard.annotation_editor.await_map(added, body.author, repair, trees, pair)
     return await edited(dashboard, body, {"id": added}, 201)
 
 
@@ -112,7 +117,7 @@ def _carried(dashboard: Dashboard, repairs: Sequence[Repair]) -> list[tuple[int,
     editor, trees = dashboard.annotation_editor, dashboard.shown.frame.trees
     for repair in editor.repairs:
         if repair not in dashboard.shown.repairs and not repair.is_of_loop:
-            trees, _ = repaired_trees(trees, repair, int(trees.number.max(initial=0)) + 1)
+            trees, _ = repaired_trees(trees, repair)
     return carried_by(trees, [*editor.rows, *editor.skipped], repairs)
 
 

@@ -50,7 +50,7 @@ export function roughly(seconds) {
 
 // --- trees -------------------------------------------------------------------------------------
 
-// Whether the sigma of a tree is assumed: no single scan detected it, only the accumulated scans did.
+// Whether the sigma of a tree is assumed: no single scan detected it there, only the accumulated scans did, or a person placed it.
 export const isAssumed = (tree) => tree.observations === 0;
 
 // A figure of a tree with the decimals that it has in the files.
@@ -62,4 +62,4 @@ export const dbhText = ({ dbh_cm: dbh, sigma_dbh_cm: sigma }) => (dbh === null ?
 
 export const heightText = ({ height_m: height, sigma_height_m: sigma }) => (known(height) ? `${heightFigure(height, sigma)} m` : "not seen");
 
-export const seenText = (tree) => (isAssumed(tree) ? "detected in no single scan, only in the accumulated scans" : `detected in ${count(tree.observations, "scan")}`);
+export const seenText = (tree) => (isAssumed(tree) ? "detected there in no single scan, only in the accumulated scans or by a person" : `detected in ${count(tree.observations, "scan")}`);

@@ -69,14 +69,19 @@ const voteText = ([name, part]) => `${name} ${share(part)}`;
 export function columnFigure(story, title) {
   if (!story) return el("figure", {}, el("figcaption", { text: title }),
     el("p", { class: "dim note", text: "Nothing upright in the accumulated scans of this place yet. Scans are accumulated at intervals (Tune, Classification); presets that do not classify, such as paper, accumulate none." }));
-  const votes = Object.entries(story.votes).filter(([, part]) => part >= 0.005).sort((a, b) => b[1] - a[1]);
   return el("figure", { "data-gathered": story.verdict },
     el("figcaption", { text: title }),
-    el("div", { class: "votes", role: "img", "aria-label": votes.map(voteText).join(", ") },
-      ...votes.map((vote) => el("i", { style: { background: `var(--${verdictOf(vote[0])[1]})`, flexGrow: String(vote[1]) }, title: voteText(vote) }))),
-    el("ul", { class: "vote-list" }, ...votes.map((vote) => el("li", {}, letterOf(verdictOf(vote[0])), voteText(vote)))),
+    ...voteNodes(story.votes),
     el("p", { class: "note", text: reason(story) }),
     story.effects.length ? influence(story.effects) : "");
+}
+
+// A bar and a list of the shares of the votes, largest first.
+export function voteNodes(shares) {
+  const votes = Object.entries(shares).filter(([, part]) => part >= 0.005).sort((a, b) => b[1] - a[1]);
+  return [el("div", { class: "votes", role: "img", "aria-label": votes.map(voteText).join(", ") },
+    ...votes.map((vote) => el("i", { style: { background: `var(--${verdictOf(vote[0])[1]})`, flexGrow: String(vote[1]) }, title: voteText(vote) }))),
+  el("ul", { class: "vote-list" }, ...votes.map((vote) => el("li", {}, letterOf(verdictOf(vote[0])), voteText(vote))))];
 }
 
 function reason(story) {

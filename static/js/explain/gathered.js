@@ -13,12 +13,11 @@ const SIZE = 240, WIDTH = 130, LEFT = 34; // of the two pictures, and of the hei
 
 const dots = (places, cls) => svg("path", { d: places.map(([x, y]) => `M${x.toFixed(1)} ${y.toFixed(1)}h0`).join(""), class: `cloud ${cls}` });
 
-export function gatheredFigure({ points, dbh }) {
-  const title = "Accumulated points";
+export function gatheredFigure({ points, dbh }, title = "Accumulated points", without = "the tree has no DBH yet, so no circle is fitted") {
   if (!points.length) return el("figure", {}, el("figcaption", { text: title }), el("p", { class: "dim note", text: "None at this place yet. Scans are accumulated at intervals (Tune, Classification); presets that do not classify, such as paper, accumulate none." }));
   const atBreast = ([, , z]) => z >= LOW && z < HIGH;
   const near = points.filter(atBreast), others = points.filter((point) => !atBreast(point));
-  const found = dbh === null ? "the tree has no DBH yet, so no circle is fitted" : `green: the fitted circle at breast height, DBH ${figure(100 * dbh)} cm`;
+  const found = dbh === null ? without : `green: the fitted circle at breast height, DBH ${figure(100 * dbh)} cm`;
   return el("figure", { class: "gathered" },
     el("figcaption", { text: title }),
     el("div", { class: "gathered-views" }, fromAbove(near, others, dbh), fromTheSide(near, others, dbh)),

@@ -26,7 +26,7 @@ function verdict(story) {
 }
 
 function seen(story) {
-  if (isAssumed(story)) return ["No single scan detected it, only the accumulated scans did: its position is that of their returns, and the uncertainty is assumed, not measured."];
+  if (isAssumed(story)) return ["No single scan detected it here: the position is that of the accumulated scans, or of a person who moved or split it, and the uncertainty is assumed, not measured."];
   // A little later, since the time of a scan may be rounded downwards.
   return [`Detected in ${count(story.observations, "scan")}, first at `, timeLink(story.first_seen_s + 0.005), ", last at ", timeLink(story.last_seen_s + 0.005), "."];
 }

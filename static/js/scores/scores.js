@@ -3,7 +3,7 @@
 import { contradictionText, reviewProgress, scoreAgainst, truthText } from "../annotate/annotations.js";
 import { byId, definitions, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
-import { capital, figure, NONE, percent } from "../core/format.js";
+import { capital, count, figure, NONE, percent } from "../core/format.js";
 import { isDrive, on, state } from "../core/store.js";
 import { openSources } from "../open/dialog.js";
 import { throttled } from "../core/timing.js";
@@ -56,8 +56,9 @@ function rates(score) {
 }
 
 // A drive is scored near its path only, so the counts can be smaller than the numbers of true and mapped trees.
-function counted({ reach_m: reach }) {
-  return !isDrive() ? "" : el("p", { class: "note dim", text: `Counted: what is within ${reach} m of the path (Tune, Evaluation, Reach).` });
+function counted({ reach_m: reach, beyond }) {
+  const left = beyond ? ` ${count(beyond, "object of the ground truth is farther and does", "objects of the ground truth are farther and do")} not count.` : "";
+  return !isDrive() ? "" : el("p", { class: "note dim", text: `Counted: what is within ${reach} m of the path (Tune, Evaluation, Reach).${left}` });
 }
 
 function lines(score) {

@@ -33,7 +33,7 @@ const COLUMNS = [
   ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or it was not seen", (t) => heightFigure(t.height_m, t.sigma_height_m), (t) => t.height_m, true],
   ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg, true],
   ["e", "e", "Eccentricity: ratio of the eigenvalues of the covariance of a cluster, the mean over its scans", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
-  ["seen", "scans", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
+  ["seen", "scans", "Number of scans that detected the tree; 0: found only in the accumulated scans, or placed by a person", (t) => String(t.observations), (t) => t.observations, false],
 ];
 const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
 const rows = new Map();
@@ -85,7 +85,7 @@ function rowOf(tree) {
   }
   const row = rows.get(tree.number);
   COLUMNS.forEach(([, , , text], place) => setText(row.cells[place], text(tree)));
-  row.cells[SIGMA].title = isAssumed(tree) ? "Assumed, not measured: no single scan detected this tree, only the accumulated scans did" : "";
+  row.cells[SIGMA].title = isAssumed(tree) ? "Assumed, not measured: no single scan detected the tree here, only the accumulated scans did, or a person placed it" : "";
   row.setAttribute("aria-selected", String(tree.number === state.selected));
   return row;
 }

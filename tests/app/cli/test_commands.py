@@ -58,6 +58,14 @@ def test_an_option_that_is_mistyped_is_named(capsys):
     )
 
 
+def test_a_second_source_is_refused_with_what_to_do(capsys):
+    stemmap(capsys, "info", RUN, "sim:stand").refused(
+        2, "stemmap info takes one SOURCE, and sim:stand is one more", "Call it again for sim:stand."
+    )
+    told = stemmap(capsys, "merge", "a", "b", "c", "--out", "d")
+    told.refused(2, "takes one DIR_A and one DIR_B, and c is one more")
+
+
 def test_compilation_is_reported_once_and_then_its_progress(capsys, monkeypatch):
     monkeypatch.setattr("pipeline.jit.on_compiling", on_compiling)  # which tests/conftest.py replaces
     now, compiled = [0.0], [0]
@@ -372,7 +380,7 @@ def test_evaluating_prints_the_lines_of_the_mapping(mapped, capsys):
     told = stemmap(capsys, "evaluate", mapped)
     assert told.code == 0
     begin = [line.split(" ")[0] for line in told.out.splitlines()]
-    assert begin == ["trees", "other", "completeness", "position"]
+    assert begin == ["trees", "not", "other", "completeness", "position"]
 
 
 def test_evaluating_by_a_table_and_by_other_distances(mapped, tmp_path, capsys):
@@ -388,6 +396,21 @@ def test_evaluating_by_a_table_and_by_other_distances(mapped, tmp_path, capsys):
     wide = json.loads(stemmap(capsys, "evaluate", mapped, "--reach", "200", "--json").out)
     assert wide["TA"]["of"] == 7
     stemmap(capsys, "evaluate", mapped, "--match-distance", "99").refused(2, "evaluation.match_distance")
+
+
+@pytest.mark.parametrize("words", [(), ("--json",)])
+def test_diameters_of_a_wrong_unit_end_with_3(mapped, tmp_path, capsys, words):
+    run, table = shutil.copytree(mapped, tmp_path / "run"), tmp_path / "truth.csv"
+    head, *rows = (mapped / "trees.csv").read_text().splitlines()
+    cells = [[*row.split(",")[:5], "30.0", *row.split(",")[6:]] for row in rows]
+    (run / "trees.csv").write_text("\n".join([head, *map(",".join, cells)]) + "\n")
+    for unit, code in (("cm", 0), ("mm", 3)):
+        lines = [f"x_m,y_m,dbh_{unit}", *(",".join((x, y, dbh)) for _, x, y, _, _, dbh, *_ in cells)]
+        table.write_text("\n".join(lines) + "\n")
+        told = stemmap(capsys, "evaluate", run, "--truth", table, *words)
+        assert told.code == code
+        doubt = "the diameters of the ground truth are about 1/10 of those of the map"
+        assert (doubt in (told.err if words else told.out)) is (code == 3)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,17 +19,19 @@ from websockets.asyncio.client import connect
 from websockets.typing import Origin
 
 from app.common.settings import Settings
-from app.dashboard.annotations import AnnotationEditor, counted, laid_over, truth_of
+from app.dashboard.annotations import AnnotationEditor, _successors, counted, laid_over, truth_of
 from app.dashboard.dashboard import Dashboard
 from app.store.async_store import LARGEST_QUEUE, AsyncStore, StoreBusyError
 from app.store.records import Annotation, Content, contents_of
 from app.web.auth import session_value
 from app.web.routes.annotations import _imported, _ImportTable
 from app.worker.protocol import Shown
+from pipeline.geometry.columns import rows_of
 from pipeline.io.ground_truth import parse_truth_trees
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, ENDS, TOKEN, Running, running, served
+from tests.pipeline.strategies import trees
 
 ANN = {"browser": "a" * 16, "who": "Ann"}
 BOB = {"browser": "b" * 16, "who": "Bob"}
@@ -448,3 +451,13 @@ def test_who_asks_for_one_of_two_truths_is_not_told_the_other() -> None:
     assert truth_of(None, rows, "own") is None
     assert truth_of(truth_trees(), [], "annotations") is None
     assert (counted(None, rows, "both"), counted(None, rows, "annotations")) == ("annotations",) * 2
+
+
+def test_merged_trees_of_a_repaired_path_are_found_by_those_that_were_seen_with_them() -> None:
+    """Three trees of the second round came to those of the first one; a fourth has no other."""
+    first = np.array([[0.0, 0.0], [6.0, 0.0], [12.0, 0.0]])
+    before = trees(np.concatenate([first, first + np.array([1.5, 3.0]), [[19.5, 3.0]]]))
+    before = replace(before, first_seen_ns=np.array([0, 1, 2, 10, 11, 12, 13]) * 10**9)
+    after = rows_of(before, np.array([0, 1, 2, 6]))
+    after.position[3] = (18.0, 0.0)
+    assert _successors(before, after, (2, 5)) == {1: 1, 2: 2, 3: 3, 7: 7, 5: 2, 4: 1, 6: 3}

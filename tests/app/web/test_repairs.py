@@ -4,14 +4,17 @@ imported."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import httpx
 import msgspec
+import numpy as np
 import pytest
 
 from app.dashboard.shown_run import ShownRun
 from app.worker.protocol import SetRepairs, WorkerBusyError
+from pipeline.geometry.columns import rows_of
 from pipeline.repairs.record import Repair, repairs_text
 from pipeline.repairs.trees import repaired_trees
 from tests.app.dashboard.test_annotations import ANN, edit, show, until
@@ -121,7 +124,7 @@ async def test_merged_trees_keep_one_annotation_which_is_removed_with_the_merge(
         before = [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)]
         shown = dashboard.shown
         merge = Repair("merge", places=(tuple(a), tuple(b)))
-        merged, _ = repaired_trees(shown.frame.trees, merge, 0)  # type: ignore[union-attr]
+        merged, _ = repaired_trees(shown.frame.trees, merge)  # type: ignore[union-attr]
         assert (await repair(client, kind="merge", places=[a, b])).status_code == 201
         (row,) = await trees_of(client)
         assert (row["x"], row["y"]) == pytest.approx(tuple(merged.position[0]), abs=1e-3)
@@ -134,6 +137,46 @@ async def test_merged_trees_keep_one_annotation_which_is_removed_with_the_merge(
         assert [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)] == before
         await edit(client, "POST", "/undo")
         assert len(await trees_of(client)) == 1
+
+
+async def test_annotations_follow_the_trees_that_a_repair_of_the_path_moves_and_merges() -> None:
+    async with running() as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        shown = dashboard.shown
+        assert shown is not None
+        trees, north = shown.frame.trees, np.array([0.0, 2.0])
+        for k, dbh in ((0, None), (1, 30.0), (2, 40.0)):
+            x, y = trees.position[k].tolist()
+            await edit(client, "POST", x=x + 0.1, y=y, kind="tree", dbh_cm=dbh)
+        before = [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)]
+        places = [trees.position[k].tolist() for k in (0, 1)]
+        assert (await repair(client, kind="tie", places=places)).status_code == 201
+        await until(lambda: len(sent(dashboard.worker)) == 1)
+        assert [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)] == before
+
+        # The map with the repair: the second tree came to the first one and was merged with it.
+        tied = rows_of(replace(trees, position=trees.position + north), np.array([0, 2, 3]))
+        tied.position[0] = trees.position[0]
+        frame = replace(shown.frame, trees=tied)
+        answer = msgspec.structs.replace(
+            shown, frame=frame, path_start=len(shown.path.x), path=rows_of(shown.path, []),
+            odometry_xy=np.zeros((0, 2)), repairs=sent(dashboard.worker), problems=("",),
+        )  # fmt: skip
+        await dashboard.receive(answer)
+        found = [(round(row["x"], 3), round(row["y"], 3), row["dbh_cm"]) for row in await trees_of(client)]
+        east = np.array([0.1, 0.0])
+        first, third = np.round([trees.position[0] + east, trees.position[2] + north + east], 3).tolist()
+        assert found == [(*first, 30.0), (*third, 40.0)]
+        await dashboard.receive(answer)  # once only
+        assert len(await trees_of(client)) == 2
+        for way, number in (("undo", 3), ("redo", 2), ("undo", 3), ("redo", 2)):
+            await edit(client, "POST", f"/{way}")
+            assert len(await trees_of(client)) == number
+        (tie,) = (await client.get("/api/annotations")).json()["others"]["repair"]
+        await edit(client, "DELETE", f"/{tie['id']}", version=tie["version"])
+        back = [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)]
+        assert np.array(back, float) == pytest.approx(np.array(before, float), nan_ok=True)
 
 
 @pytest.mark.parametrize(

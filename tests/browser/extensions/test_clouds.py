@@ -16,16 +16,19 @@ from tests.app.extensions.clouds.test_crowns import flat, tree
 from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
-from tests.pipeline.plots import write_las
+from tests.browser.test_annotate import place_of
+from tests.pipeline.plots import bush, write_las
 
 PLACES = ((2.5, 2.5, 10.0), (7.5, 2.5, 12.0), (2.5, 7.5, 9.0), (7.5, 7.5, 11.0))  # x, y, height [m]
+BUSH = (5.0, 5.0)
 UTM = (470600.0, 3810200.0, 300.0)
 
 
 @pytest.fixture(scope="module")
 def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(2)
-    points = np.concatenate([flat(10.0, rng), *(tree(x, y, rng, top) for x, y, top in PLACES)])
+    stems = [tree(x, y, rng, top) for x, y, top in PLACES]
+    points = np.concatenate([flat(10.0, rng), *stems, bush(*BUSH, rng)])
     file: Path = tmp_path_factory.mktemp("clouds") / "plot.laz"
     write_las(file, points, offset=UTM, crs="EPSG:26912")
     return file
@@ -120,6 +123,17 @@ def test_a_cloud_is_opened_and_its_stems_have_sections_and_heights(page: Dashboa
     expect(story.locator(".section.breast .fitted")).to_have_count(1)
     assert story.locator(".section .point").count() > 200
     expect(story.get_by_text("Stem curve")).to_be_visible()
+
+
+def test_a_candidate_that_is_no_tree_shows_why(page: Dashboard) -> None:
+    page.page.locator("#map").click(position=place_of(page, *BUSH))
+    story = page.page.locator("#panel-story")
+    expect(story.locator(".verdict")).not_to_have_attribute("data-verdict", "tree")
+    pictures = story.locator(".gathered-views .picture")
+    expect(pictures).to_have_count(2)
+    assert len(pictures.last.locator("path.cloud").first.get_attribute("d") or "") > 1000
+    expect(story.get_by_text("points around it")).to_be_visible()
+    expect(story.locator(".vote-list li").first).to_contain_text("%")
 
 
 def test_a_slider_maps_the_cloud_again_and_only_those_of_the_inventory_are_shown(page: Dashboard) -> None:

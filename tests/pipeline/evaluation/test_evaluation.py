@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,44 @@ def test_a_truth_that_few_trees_match_is_doubted(right, elsewhere, missed, doubt
     if doubtful:
         assert told.startswith(f"only 1 of {right + missed} true trees is near" if right else "none of 16")
         assert f"warning: {told}" in evaluation_lines(score)
+
+
+def test_what_is_beyond_the_reach_is_counted():
+    found, kinds = np.array([[0.0, 0.0]]), ("tree", "tree", "pole", "hidden")
+    truth = truth_trees(np.array([[0.0, 0], [30, 0], [40, 0], [50, 0]]), kinds)
+    score = evaluate(trees(found), truth, FOREST, np.zeros((1, 2)))
+    assert (score.TA.of, score.beyond) == (1, 2)
+    assert "not counted: 2 objects of the ground truth are farther from the path (evaluation.reach)" in (
+        evaluation_lines(score)
+    )
+    assert evaluate(trees(found), truth, FOREST).beyond == 0
+
+
+@pytest.mark.parametrize(
+    ("factor", "told"),
+    [
+        (1.0, ""),
+        (3.0, ""),
+        (0.3, ""),
+        (13.0, "10 times"),
+        (90.0, "100 times"),
+        (0.12, "1/10 of"),
+        (0.001, "1/1000 of"),
+    ],
+)
+@pytest.mark.parametrize("n", [3, 4])
+def test_diameters_of_another_unit_are_doubted(factor, told, n):
+    place = np.column_stack([5.0 * np.arange(n), np.zeros(n)])
+    truth = truth_trees(place, ("tree",) * n)
+    truth = replace(truth, dbh=trees(place).dbh * factor * np.linspace(0.9, 1.1, n))
+    score = evaluate(trees(place), truth, FOREST)
+    assert score.dbh_ratio == pytest.approx(factor, rel=0.1)
+    doubt = truth_in_doubt(score)
+    assert (
+        doubt.startswith(f"the diameters of the ground truth are about {told}")
+        if told and n > 3
+        else not doubt
+    )
 
 
 @given(seeds, st.integers(0, 12), st.integers(0, 12), st.booleans())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
@@ -94,8 +95,20 @@ def test_a_tree_in_the_promised_units():
         "height_m": "",
         "sigma_height_m": "",
         "lean_deg": "",
+        "sigma_assumed": "0",
         "review": "open",
     }
+
+
+def test_the_columns_of_detections_are_documented():
+    told = (FilePath(__file__).parents[3] / "docs" / "commands.md").read_text(encoding="utf-8")
+    section = told.partition("## Detections")[2].partition("\n## ")[0]
+    assert [name for name in DETECTION_COLUMNS if f"`{name}`" not in section] == []
+
+
+def test_a_tree_that_no_scan_detected_is_marked():
+    t = replace(trees([[1.0, 2.0]]), observations=np.zeros(1, np.int64))
+    assert dict(zip(TREE_COLUMNS, tree_rows(t, 0)[0], strict=True))["sigma_assumed"] == "1"
 
 
 def test_what_is_not_known_of_a_tree_is_empty_and_not_zero():

@@ -256,7 +256,7 @@ def test_a_deleted_thing_is_gone_with_its_copies():
     x, y = trees.position[row].tolist()
     for repair in (Repair("delete", ((x, y),)), Repair("class", ((x, y),), value="pole")):
         assert set(numbers_of(copies, repair)) == {trees.number[row], copies.number[-1]}
-        after, problem = repaired_trees(copies, repair, 100_001)
+        after, problem = repaired_trees(copies, repair)
         assert problem == ""
         left = after.position[after.confirmed]
         assert np.hypot(*(left - [x, y]).T).min() > 0.5

@@ -18,7 +18,7 @@ from pipeline.repairs.record import (
     tied_numbers,
     unapplied,
 )
-from pipeline.repairs.trees import FIRST_ADDED, repaired_trees
+from pipeline.repairs.trees import repaired_trees
 from pipeline.types.records import Path, Trees
 from tests.pipeline.strategies import trees
 
@@ -26,7 +26,7 @@ THREE = trees([[0.0, 0.0], [5.0, 0.0], [9.0, 1.0]])
 
 
 def repaired(kind: Kind, *places: tuple[float, float], value: str = "", of: Trees = THREE) -> Trees:
-    found, problem = repaired_trees(of, Repair(kind, places, value=value), FIRST_ADDED)
+    found, problem = repaired_trees(of, Repair(kind, places, value=value))
     assert problem == ""
     return found
 
@@ -66,6 +66,11 @@ def test_a_merged_tree_has_no_more_scans_than_the_union_of_both():
     assert repaired("merge", (0.0, 0.0), (9.0, 1.0), of=apart).observations[0] == 4
 
 
+def test_a_position_by_a_person_has_no_scans_so_that_its_sigma_counts_as_assumed():
+    assert repaired("move", (0.0, 0.0), (0.4, 0.0)).observations.tolist() == [0, 9, 9]
+    assert repaired("split", (0.0, 0.0), (0.4, 0.0)).observations.tolist() == [9, 9, 9, 0]
+
+
 @pytest.mark.parametrize(("a", "b"), [((23.1, 1.3), (14.5, 1.1)), ((30.0, 0.2), (20.0, 3.0))])
 def test_the_mean_of_contradicting_diameters_covers_both(a: tuple[float, float], b: tuple[float, float]):
     dbh, sigma = np.array([a, b, (np.nan, np.nan)]).T / 100.0
@@ -82,9 +87,15 @@ def test_the_mean_of_contradicting_diameters_covers_both(a: tuple[float, float],
 
 def test_a_split_tree_is_two_without_diameters():
     found = repaired("split", (5.0, 0.1), (5.6, 0.0))
-    np.testing.assert_array_equal(found.number, [1, 2, 3, FIRST_ADDED])
+    np.testing.assert_array_equal(found.number, [1, 2, 3, 2001])
     np.testing.assert_array_equal(found.position[[1, 3]], [[5.0, 0.0], [5.6, 0.0]])
     np.testing.assert_array_equal(np.isnan(found.dbh), [False, True, False, True])
+
+
+def test_the_second_stem_has_the_number_of_its_tree_with_a_counter():
+    once = repaired("split", (5.0, 0.0), (5.6, 0.0))
+    twice = repaired("split", (5.0, 0.0), (5.0, 0.6), of=once)
+    assert twice.number.tolist() == [1, 2, 3, 2001, 2002]
 
 
 def test_move_class_and_delete_change_one_row():
@@ -97,7 +108,7 @@ def test_move_class_and_delete_change_one_row():
 
 
 def test_a_tree_is_not_merged_with_itself():
-    found, problem = repaired_trees(THREE, Repair("merge", ((0.0, 0.0), (0.2, 0.0))), FIRST_ADDED)
+    found, problem = repaired_trees(THREE, Repair("merge", ((0.0, 0.0), (0.2, 0.0))))
     assert found is THREE
     assert problem == "both positions are of tree 1"
 

@@ -6,6 +6,8 @@ import { count, dbhFigure, figure, fixed, heightFigure, NONE } from "../../core/
 import { circle, line, picture, scaleBar, svg, text } from "../../core/svg.js";
 import { verdictOf } from "../../core/verdicts.js";
 import { checks, failureText, verdict } from "../../explain/cluster.js";
+import { voteNodes } from "../../explain/columns.js";
+import { gatheredFigure } from "../../explain/gathered.js";
 
 const SIZE = 120; // of the picture of a section
 const BREAST = 1.3; // [m]
@@ -20,15 +22,31 @@ export function treeStory(story) {
 
 export function clusterStory(story) {
   const stem = story.extensions.clouds;
-  return stem ? [verdict(story, why(story)), sectionsFigure(stem.sections), checks(story)] : [];
+  if (!stem) return [];
+  const known = circlesOf(stem), breast = known.length ? known.reduce((a, b) => (Math.abs(a.height - BREAST) < Math.abs(b.height - BREAST) ? a : b)) : null;
+  return [verdict(story, why(story, known.length)),
+    gatheredFigure({ points: stem.around, dbh: breast && Math.abs(breast.height - BREAST) < 0.3 ? 2 * breast.radius : null }, "Points of the cloud around it", "no circle is fitted there"),
+    candidateFigures(stem, known), known.length ? sectionsFigure(stem.sections) : "", checks(story),
+    el("figure", {}, el("figcaption", { text: "Votes of the decision trees" }), ...voteNodes(stem.votes))];
+}
+
+const circlesOf = ({ sections }) => sections.filter(({ radius }) => radius !== null);
+
+function candidateFigures({ around }, known) {
+  const middle = (values) => values.sort((a, b) => a - b)[values.length >> 1];
+  const top = Math.max(...around.map(([, , z]) => z));
+  return definitions([
+    ["circles", known.length ? `in ${count(known.length, "slice")}, ${figure(known[0].height)} to ${figure(known.at(-1).height)} m above the ground` : "none"],
+    ...(known.length ? [["roughness of the bark", `${figure(100 * middle(known.map(({ scatter }) => scatter)), 2)} cm`], ["covered", `${figure(middle(known.map(({ coverage_deg: covered }) => covered)))}° of 360°`]] : []),
+    ["points around it", around.length ? `up to ${figure(top)} m above the ground` : "none"]]);
 }
 
 export function treeEvidence({ extensions }) {
   return extensions.clouds ? [sectionsFigure(extensions.clouds.sections)] : [];
 }
 
-function why(story) {
-  if (!story.checks.length) return "It stands upright like a stem, but too few of its slices show a circle.";
+function why(story, circles) {
+  if (!story.checks.length) return `It stands upright like a stem, but ${circles ? "only one of its slices shows" : "none of its slices shows"} a circle: a stem needs two. ${story.verdict === "no arc" ? "The decision trees vote for a tree." : `The decision trees vote for ${story.verdict}.`}`;
   const failed = story.checks.find((check) => check.fails);
   if (failed) return failureText(failed);
   if (story.verdict === "tree") return `It passed all checks below. It is tree ${story.tree} of the map.`;

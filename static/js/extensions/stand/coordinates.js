@@ -42,7 +42,7 @@ function add(point) {
 function addSelected() {
   const tree = selectedTree();
   if (tree) add({ tree: tree.number });
-  else fail("Select a tree first: click it on the map or in the table.");
+  else fail(UNSELECTED);
 }
 
 function changed() {
@@ -55,6 +55,13 @@ function changed() {
 function fail(text) {
   draft.error = text;
   news();
+}
+
+const UNSELECTED = "Select a tree first: click it on the map or in the table.";
+
+// The message is about the selection before.
+function selected() {
+  if (selectedTree() && draft.error === UNSELECTED) fail("");
 }
 
 const number = (text) => (String(text).trim() === "" ? null : Number(text));
@@ -143,6 +150,7 @@ function cell(point, row, name, title) {
       const typed = number(event.target.value);
       point[name] = axis < 0 ? event.target.value : typed === null ? "" : inMap(typed, typed)[axis];
       dirty = true;
+      draft.error = ""; // it was about the fields before
       fillResiduals();
       news();
     } }));
@@ -218,5 +226,6 @@ function fill() {
 export function startCoordinates() {
   build();
   on("annotations", load);
+  on("selection", selected);
   on("tab map annotating sketch status", fill);
 }

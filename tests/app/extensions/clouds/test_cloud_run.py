@@ -233,7 +233,12 @@ def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(sessio
         else:
             assert failed == [] or story.verdict == failed[0]
             others += 1
-        assert story.extensions["clouds"].sections
+        stem = story.extensions["clouds"]
+        assert stem.sections
+        assert sum(stem.votes.values()) == pytest.approx(1.0, abs=0.01)
+        around = np.array(stem.around)
+        assert len(around) > 100
+        assert np.hypot(*around[:, :2].T).max() < 0.76
         assert (story.tree is not None) == (story.verdict == "tree")
     assert others == 3, "bushes"
     with pytest.raises(StemmapError, match="no cluster"):

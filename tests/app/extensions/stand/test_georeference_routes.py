@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import csv
 import json
 import tempfile
 from pathlib import Path
@@ -62,6 +63,12 @@ async def test_control_points_place_the_files_as_on_the_command_line(both, tmp_p
     assert np.abs([row[1:] for row in found["frame"]["residuals_m"]]).max() < 0.002
     assert (await client.get("/api/plots")).json()["all"]["crs"] == UTM
 
+    assert dashboard.shown is not None
+    expected = TRUE.apply(dashboard.shown.frame.trees.position[:1])[0]
+    (first, *_) = csv.DictReader((await client.get("/api/trees.csv")).text.splitlines())
+    east_north = [float(first[name]) for name in ("easting_m", "northing_m")]
+    assert east_north == pytest.approx(expected.tolist(), abs=0.003)
+
     run = tmp_path / "run"
     write_texts(run, ShownRun.of(dashboard).texts())
     table = ["name,tree,x_m,y_m,easting,northing"]
@@ -80,8 +87,6 @@ async def test_control_points_place_the_files_as_on_the_command_line(both, tmp_p
         assert (await client.get(f"/api/export/{suffix}")).content == out.read_bytes(), suffix
     layer = geopandas.read_file(tmp_path / "trees.gpkg", layer="trees")
     assert layer.crs == UTM
-    assert dashboard.shown is not None
-    expected = TRUE.apply(dashboard.shown.frame.trees.position[:1])[0]
     assert layer.geometry[0].x == pytest.approx(expected[0], abs=0.003)
     assert "EPSG:25832" in (await client.get("/api/runs/open/report/html", timeout=60.0)).text
 

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import tomllib
+from dataclasses import asdict
 from html.parser import HTMLParser
 from importlib.resources import files
 from pathlib import Path
@@ -19,10 +20,13 @@ from app.batch.run_folder import recorded_time
 from app.extensions.stand.figures import Estimate
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.report import Numbers, _digits, find_browser
+from pipeline.config import Parameters
 from pipeline.config.model import field_specs, stage_specs
-from pipeline.types.records import Verdict
+from pipeline.evaluation import evaluate
+from pipeline.types.records import TruthTrees, Verdict
 from tests.app.batch.finished_runs import grid_run, write_run
 from tests.app.cli.test_commands import stemmap
+from tests.pipeline.strategies import trees
 
 
 class Page(HTMLParser):
@@ -327,3 +331,13 @@ def test_heights_and_residuals_are_listed_where_there_are_any(run, tmp_path, cap
     stemmap(capsys, "georeference", run, "--control", points, "--crs", "EPSG:25832")
     shown = Page(page_of(capsys, run, tmp_path / "full.html")).texts
     assert {"Height m", "21.40", "0.30", "1: \N{MINUS SIGN}1.0, 0.0; 2: 1.0, 0.0"} <= set(shown)
+
+
+def test_references_that_do_not_count_are_named(tmp_path, capsys):
+    run = grid_run(tmp_path / "run")
+    record = json.loads((run / "run.json").read_text())
+    near = np.zeros((1, 2))
+    truth = TruthTrees(np.array([1.0, 30.0]), np.zeros(2), np.full(2, 0.3), ("tree", "tree"))
+    record["evaluation"] = asdict(evaluate(trees(np.zeros((1, 2))), truth, Parameters().evaluation, near))
+    (run / "run.json").write_text(json.dumps(record))
+    assert "that do not count, too far from the path (10 m)" in page_of(capsys, run, tmp_path / "a.html")
