@@ -46,9 +46,9 @@ class _ImportRepairs(Edit):
 @router.post("/repairs")
 async def add(body: _AddRepair, dashboard: Dash) -> Response:
     """Add a repair; the annotations of moved and merged trees follow, at a repair of the path once the map
-    has it. Return its number (`id`) and the counts
-    of edits, see `edited`, with 201. 409 before the first map or if another run was opened meanwhile, 422 for
-    a repair that is not valid, and for a tie of a position without a tree."""
+    has it. Return its number (`id`) and the counts of edits, see `edited`, with 201. 409 before the first map
+    or if another run was opened meanwhile, 422 for a repair that is not valid, and for a tie of a position
+    without a tree."""
     if len(dashboard.annotation_editor.repairs) >= MOST:
         raise BadRequestError(f"a run can have at most {MOST} repairs")
     repair = _repair(body, dashboard)
