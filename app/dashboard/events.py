@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -15,6 +16,7 @@ Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "sil
 
 _OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
+_COUNT = re.compile(r" \(\d+[^()]*\)$")
 _LONGEST = 300
 
 
@@ -37,7 +39,8 @@ class Event:
 
 
 class Events:
-    """Events of a run, at most 400; the oldest trees are removed first, then the oldest others.
+    """Events of a run, at most 400. Beyond them the oldest trees are removed first, then warnings and edits,
+    and stops, silences and the pose quality last.
 
     After a change of parameters, events later than the current scan remain, flagged as from before the
     change, until the run reaches them again.
@@ -125,14 +128,16 @@ class Events:
             self._note(f"tree {number}", Event(at, "tree", f"Tree {number} mapped"))
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
-        """Add events for warnings that were not active in the last call; return whether there are any.
+        """Add events for warnings that were not active in the last call, without the count at their end,
+        which grows while they are active; return whether there are any.
 
         Args:
             warnings: All active warnings.
             time_s: Time of the current scan [s since the first scan].
         """
-        new = [warning for warning in warnings if warning not in self._warnings]
-        self._warnings = frozenset(warnings)
+        active = frozenset(_COUNT.sub("", warning) for warning in warnings)
+        new = sorted(active - self._warnings)
+        self._warnings = active
         for warning in new:
             self._note(f"warning {time_s:.1f} {warning}", Event(time_s, "warning", warning[:_LONGEST]))
         return bool(new)
@@ -220,8 +225,13 @@ class Events:
         return dict(zip(frame.trees.number[rows].tolist(), confirmed_s[rows].tolist(), strict=True))
 
     def _note(self, key: str, event: Event) -> None:
-        """Add an event unless one has its key; beyond _MOST, remove the oldest tree, or the oldest event."""
+        """Add an event unless one has its key; beyond _MOST, remove the oldest of those that go first."""
         self._events.setdefault(key, event)
         while len(self._events) > _MOST:
-            trees = (known for known, each in self._events.items() if each.kind == "tree")
-            del self._events[next(trees, next(iter(self._events)))]
+            del self._events[min(self._events, key=lambda known: _goes(self._events[known].kind))]
+
+
+def _goes(kind: Kind) -> int:
+    """Return the place of a kind in the order in which events are removed: what an operator is asked for
+    afterwards goes last."""
+    return 0 if kind == "tree" else 2 if kind in ("stop", "silence", "health") else 1

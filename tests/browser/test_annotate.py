@@ -348,6 +348,36 @@ def test_a_held_key_and_keys_faster_than_a_look_answer_for_no_unseen_tree(person
     assert person.errors == []
 
 
+def test_a_second_click_adds_no_second_annotation_and_the_same_answer_has_no_undo(person: Dashboard):
+    page = person.page
+    canvas = page.locator("#map")
+    canvas.press("a")
+    free = {"x": 20.0, "y": 60.0}  # far from all trees
+    canvas.dblclick(position=free)
+    expect(page.locator("#annotations tbody tr")).to_have_count(1)
+    canvas.click(position=free)
+    expect(page.locator("#problem")).to_contain_text("no second one was added")
+    canvas.press("Escape")
+    assert len(rows(person)) == 1
+
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    canvas.press("s")
+    person.answer("y")
+    person.card_shown()
+    expect(page.locator("#review-back")).to_be_visible()
+    canvas.press("r")
+    person.answer("y")
+    expect(page.locator("#review-last")).to_contain_text("as before")
+    expect(page.locator("#review-back")).to_be_hidden()
+    assert len(rows(person)) == 2
+
+    person.card_shown()
+    canvas.press("p")  # leaves the review neither for "Find a parameter" nor with an answer
+    expect(page.locator("#problem")).to_contain_text("Shift+P")
+    expect(page.locator("#review-title")).to_be_visible()
+    assert person.errors == []
+
+
 def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard):
     page = person.page
     canvas = page.locator("#map")

@@ -23,6 +23,9 @@ const MOST_ANSWERED = 20; // answers to which the review returns
 // takes about 300 ms from the picture to the key (Donders 1868, Hick 1952), but three answers per second leave 333 ms between two
 // keys, of which the next card needs a part.
 const LOOK = 150;
+// [ms] the same where another browser or a click in the scene chose the tree: an answer to the tree before may be on its way, and
+// nearly all choices between two answers are made within a second (Hick 1952).
+const LOOK_UNASKED = 1000;
 // [ms] between two clicks on the answers that are one double click: the default of GTK (gtk-double-click-time).
 const DOUBLE_CLICK = 400;
 export const NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .@-]{0,39}$/u;
@@ -121,6 +124,22 @@ export async function add(content) {
 
 // An annotation, also that of a skipped tree.
 const storedRow = (id) => [...rows(), ...skips()].find((row) => row.id === id) ?? null;
+
+// Adds an annotation at a place {x, y}, unless one is there: two clicks mean one thing.
+const placing = new Set();
+export async function addAt(place) {
+  const within = state.annotations?.same_thing_m ?? 0;
+  const known = nearest(rows(), (row) => distance(row, place), within);
+  if (known) {
+    choose(known.id);
+    showNews(`An annotation (${known.kind}) is less than ${within} m from there: it is selected, and no second one was added.`);
+    return;
+  }
+  if (nearest(placing, (other) => distance(other, place), within)) return; // the second click of a double click
+  placing.add(place);
+  await add(place);
+  placing.delete(place);
+}
 
 // The version of a row as the person saw it, or a later one if only their own edits came between.
 function latest({ id, version }) {
@@ -278,6 +297,7 @@ async function answerIfSeen(tree, kind) {
     draft.shownAt = performance.now();
     refuse(`the card of tree ${number} was out of view`);
   } else if (performance.now() - draft.shownAt < LOOK) refuse(`tree ${number} had only just come into view`);
+  else if (state.selectedElsewhere && performance.now() - draft.shownAt < LOOK_UNASKED) refuse(`tree ${number} was selected elsewhere a moment ago`);
   else await answer(tree, kind);
 }
 
@@ -287,6 +307,7 @@ function refuse(why) {
   news();
 }
 
+export const refusePlain = () => refuse("Shift+P answers “pole”; P alone has no action here");
 export const refuseHeld = () => refuse("a key that is held down answers once");
 
 // Whether the middle of a node is neither scrolled away nor covered, except by the line that tells why an answer did not count.
@@ -307,6 +328,11 @@ export const byClick = (answers) => (event) => {
 
 async function answer(tree, kind, fields = {}, goesOn = true) {
   const { number } = tree, seen = annotationOf(tree);
+  if (seen && Object.entries({ kind, ...fields }).every(([name, value]) => seen[name] === value)) {
+    Object.assign(draft, { answer: { number, kind, isStored: true }, kind: "other", refused: "" });
+    if (goesOn && state.selected === number) await next();
+    return news();
+  }
   answering.add(number);
   Object.assign(draft, { answer: { number, kind }, kind: "other", refused: "" });
   const before = draft.answered;
@@ -395,7 +421,7 @@ export function previous() {
 export const answeredTrees = () => draft.answered.map(treeOf).filter((tree) => tree && (annotationOf(tree) || answering.has(tree.number)));
 
 // What the last answer of the review said ("Tree 40: pole"); "" before the first one.
-export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${draft.answer.kind}` : "");
+export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${draft.answer.kind}${draft.answer.isStored ? ", as before" : ""}` : "");
 
 // --- the chosen annotation -------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ import { throttled } from "../core/timing.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, moreEvidence, startCard } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -154,6 +154,7 @@ function fill() {
   byId("annotate-kind").value = draft.kind;
   byId("review-last").hidden = !answerText();
   setText(byId("review-last").firstChild, answerText());
+  byId("review-back").hidden = Boolean(draft.answer?.isStored); // nothing to take back
   fillHistory();
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
@@ -256,6 +257,7 @@ function keyOfTab({ key, shiftKey }) {
   else if (shiftKey && key in CLASS_KEYS) review(CLASS_KEYS[key]);
   else if (key === "s") skip();
   else if (key === "r") previous();
+  else if (key === "p" && draft.shown !== null) refusePlain(); // "Find a parameter" would leave the review
   else if (key === "Escape" && draft.adding) toggleAdding(false);
   else return false;
   return true;

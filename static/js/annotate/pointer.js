@@ -10,7 +10,7 @@ import { verdictOf } from "../core/verdicts.js";
 import { drawCircle, drawText, treeAt } from "../map/draw.js";
 import { onSceneLoad } from "../scene/scene.js";
 import { viewOf } from "../scene/viser_client.js";
-import { add, annotating, choose, draft, news, rowOf, rows, settle, showCard, treeNumberOf } from "./annotations.js";
+import { addAt, annotating, choose, draft, news, rowOf, rows, settle, showCard, treeNumberOf } from "./annotations.js";
 
 const SNAP = 0.7; // [m]
 const REACH = 11; // [px] around an annotation
@@ -74,7 +74,7 @@ export function clickAt(at, view, tree) {
   if (!annotating()) return false;
   if (draft.adding) {
     const { x, y } = snap(...view.toMap(...at));
-    add({ x, y });
+    addAt({ x, y });
   } else {
     choose(null);
     select(tree ? tree.number : null);

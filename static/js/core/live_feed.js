@@ -43,6 +43,7 @@ function receiveMap({ path, ...map }) {
 function receiveSelection(tree, cluster, place) {
   if (chosen && chosen.tree !== tree && performance.now() < chosen.until) return;
   chosen = null;
+  if (tree !== state.selected) state.selectedElsewhere = true;
   Object.assign(state, { selected: tree, selectedCluster: cluster, place });
 }
 
@@ -75,7 +76,7 @@ export function select(tree) {
   if (!sendMessage({ type: "select", tree })) return;
   // A tree that is selected already gets no answer; waiting for one would hide the next selection made elsewhere.
   if (state.selected !== tree || state.selectedCluster) chosen = { tree, until: performance.now() + ANSWER_WAIT };
-  Object.assign(state, { selected: tree, selectedCluster: null, selectedTruth: null, place: null });
+  Object.assign(state, { selected: tree, selectedElsewhere: false, selectedCluster: null, selectedTruth: null, place: null });
   changed("selection");
 }
 

@@ -140,6 +140,18 @@ def test_of_more_trees_than_marks_none_is_confirmed_again():
     assert {t for t, _, _ in told} == {0.0}
 
 
+def test_a_growing_count_is_one_event_and_warnings_displace_no_lost_pose():
+    events = Events()
+    events.shown(seen(0, 0, Health(state="lost", reason="no tree is known")), 0.0)
+    for k in range(1, 500):
+        events.warned([f"scans lost on the network ({k})"], 0.1 * k)
+    assert marks(events)[1:] == [(0.1, "warning", "scans lost on the network")]
+    for k in range(500):
+        events.warned([f"warning {k}"], 60.0 + k)
+    assert marks(events)[0] == (0.0, "health", "SLAM lost: no tree is known")
+    assert len(marks(events)) == 400
+
+
 @given(st.lists(st.tuples(st.integers(0, 900), st.integers(0, 60)), max_size=40))
 def test_they_are_bounded_and_in_order(scans: list[tuple[int, int]]):
     events = Events()
