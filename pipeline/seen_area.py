@@ -19,7 +19,7 @@ RANGE = 30.0  # m; views from farther away are not recorded
 INTO = 0.5
 # A scan is recorded after this motion [m, rad].
 SPACING, TURN = 0.5, math.radians(10.0)
-# Gaps of a cloud up to this width [m] count as covered, such as the shadow of a stem near a scanner.
+# Gaps up to this width [m] count as observed, such as the shadow of a stem or the undergrowth around it.
 GAP = 1.0
 # Rows of views that are grouped at once: their arrays take about 100 MB, while a view has 11,000 rows.
 ROWS_MOST = 1_000_000
@@ -61,6 +61,22 @@ class SeenArea:
     def where(self, keep: Bool) -> SeenArea:
         """Return the area with the rows for which `keep`, shape (K,), is true."""
         return SeenArea(self.cell, self.place[keep], self.nearest[keep], self.views[keep])
+
+    def closed(self) -> SeenArea:
+        """Return the area with gaps up to GAP closed: stems and the undergrowth around them hide ground. A
+        cell of a gap has the distance and the views of the nearest cell."""
+        from scipy.ndimage import binary_closing, distance_transform_edt
+
+        if not len(self.place):
+            return self
+        steps = math.ceil(0.5 * GAP / self.cell)  # from both sides
+        low = self.place.min(axis=0) - steps - 1
+        row = np.full(self.place.max(axis=0) - low + steps + 2, -1)
+        row[tuple((self.place - low).T)] = np.arange(len(self.place))
+        place = np.argwhere(binary_closing(row >= 0, iterations=steps))
+        nearest = distance_transform_edt(row < 0, return_distances=False, return_indices=True)
+        of = row[tuple(nearest[:, place[:, 0], place[:, 1]])]
+        return SeenArea(self.cell, place + low, self.nearest[of], self.views[of])
 
     def joined(self, other: SeenArea, T_map_other: Pose2 | None = None) -> SeenArea:
         """Return the union with the area of another drive, which has cells of the same size (not checked). A
@@ -122,17 +138,8 @@ def covered_area(points: Float) -> SeenArea:
         points: Positions x, y, shape (N, 2) [m], closer to one another than CELL. They count to the
             millimetre, so that the offset of a file does not change a cell.
     """
-    from scipy.ndimage import binary_closing
-
-    if not len(points):
-        return SeenArea(CELL, np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0, np.int64))
-    places = np.floor(np.round(points, 3) / CELL).astype(np.int64)
-    steps = math.ceil(0.5 * GAP / CELL)  # from both sides
-    low = places.min(axis=0) - steps - 1
-    raster = np.zeros(places.max(axis=0) - low + steps + 2, np.bool_)
-    raster[tuple((places - low).T)] = True
-    closed = np.argwhere(binary_closing(raster, iterations=steps)) + low
-    return SeenArea(CELL, closed, np.full(len(closed), np.nan), np.zeros(len(closed), np.int64))
+    place = np.unique(np.floor(np.round(points, 3) / CELL).astype(np.int64), axis=0)
+    return SeenArea(CELL, place, np.full(len(place), np.nan), np.zeros(len(place), np.int64)).closed()
 
 
 class ViewSelection:

@@ -352,7 +352,7 @@ def test_a_second_click_adds_no_second_annotation_and_the_same_answer_has_no_und
     page = person.page
     canvas = page.locator("#map")
     canvas.press("a")
-    free = {"x": 20.0, "y": 60.0}  # far from all trees
+    free: Position = {"x": 20.0, "y": 60.0}  # far from all trees
     canvas.dblclick(position=free)
     expect(page.locator("#annotations tbody tr")).to_have_count(1)
     canvas.click(position=free)

@@ -145,8 +145,8 @@ def stand_figures(
         perimeter: Length of the border of the observed part [m], for the edge correction of the Clark-Evans
             index.
         detection: Mean probability of detection in the observed part and its standard error; NaN if unknown.
-            With an unknown error, standard errors of stems, basal area and volume that are below NEGLIGIBLE
-            of the value are NaN: nothing that is known limits them.
+            With an unknown error or a probability below 1, standard errors of stems, basal area and volume
+            that are below NEGLIGIBLE of the value are NaN: nothing that is known limits them.
         parameters: Limits of diameters and classes.
 
     Returns:
@@ -205,7 +205,8 @@ def stand_figures(
         total, squares = float(weights.sum()), float(np.square(weights).sum())
         se = math.sqrt((1.0 - share) * squares + variance)
         assumed = math.isnan(p_se)
-        values[name] = _scaled(HECTARE / seen, total, se, assumed)
+        # This figure takes all trees in view as found: where that is not certain, 0 is no error of it.
+        values[name] = _scaled(HECTARE / seen, total, se, assumed or p < 1.0)
         if p > 0.0:
             fit = 0.0 if assumed else total * p_se / p
             spread = math.sqrt((1.0 - share * p) * squares + variance + fit**2)

@@ -215,6 +215,21 @@ def test_cells_of_unknown_distance_do_not_change_the_detection():
     assert figures["all"].values["n_ha"].value == pytest.approx(len(position) / 0.06)
 
 
+def test_cells_that_stems_and_their_undergrowth_hide_are_observed():
+    """Without them a stand lost the trees that stand in undergrowth, but hardly any area."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(20), np.arange(20)))
+    hidden = ((x == 5) & (y == 5)) | ((x > 9) & (x < 12) & (y > 9) & (y < 12)) | ((x > 13) & (y > 13))
+    place = np.stack([x, y], axis=1)[~hidden]
+    seen = SeenArea(0.5, place, np.where(place[:, 0] < 8, 3.0, 9.0), np.full(len(place), 4))
+    kept = within_reach(seen, Stand())
+    assert len(kept.place) == 400 - 35, "holes of up to 1 m are closed, the hidden corner but for its tip is not"
+    row = kept.rows(np.array([[2.75, 2.75], [5.25, 5.25], [8.0, 8.0]]))
+    assert row[2] < 0
+    assert kept.nearest[row[:2]].tolist() == [3.0, 9.0]
+    assert kept.views[row[:2]].tolist() == [4, 4]
+    assert len(within_reach(seen, Stand(reach=5.0)).place) == 20 * 8
+
+
 def test_a_cloud_covers_its_cells_and_gaps_up_to_a_metre():
     from pipeline.seen_area import covered_area
 
