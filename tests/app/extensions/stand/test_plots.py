@@ -222,7 +222,7 @@ def test_cells_that_stems_and_their_undergrowth_hide_are_observed():
     place = np.stack([x, y], axis=1)[~hidden]
     seen = SeenArea(0.5, place, np.where(place[:, 0] < 8, 3.0, 9.0), np.full(len(place), 4))
     kept = within_reach(seen, Stand())
-    assert len(kept.place) == 400 - 35, "holes of up to 1 m are closed, the hidden corner but for its tip is not"
+    assert len(kept.place) == 400 - 35, "holes up to 1 m are closed, the corner is not but for its tip"
     row = kept.rows(np.array([[2.75, 2.75], [5.25, 5.25], [8.0, 8.0]]))
     assert row[2] < 0
     assert kept.nearest[row[:2]].tolist() == [3.0, 9.0]
