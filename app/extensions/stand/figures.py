@@ -155,7 +155,7 @@ def stand_figures(
         NaN or not above 0; basal areas and volumes if there are trees, but none has a diameter or a volume;
         volumes without a formula; figures of diameters if no tree has a diameter; and those of the pattern
         for fewer than two trees. `_plain` figures have no standard error. In `v_ha`, trees without a volume
-        count as 0.
+        count with the mean volume by basal area of the others.
 
     Raises:
         ValueError: The plot has no area.
@@ -178,6 +178,7 @@ def stand_figures(
     if volumes is not None and volumes < n:
         warnings.append(
             f"volume of {volumes} of {n} trees: the others have no height, no diameter or a negative volume"
+            + ("; they count with the mean volume by basal area" if volumes else "")
         )
     if 0.0 < seen < 0.5 * area:
         warnings.append(f"only {100.0 * seen / area:.0f} % of the plot was observed")
@@ -198,9 +199,7 @@ def stand_figures(
         ("g_ha", basal, basal_var + unsure * _least_basal(parameters) ** 2),
     ]
     if kept.volume is not None and kept.volume_sigma is not None and (volumes or not n):
-        sigma = np.nan_to_num(kept.volume_sigma)
-        shared = np.zeros(n) if kept.volume_shared is None else np.minimum(kept.volume_shared, sigma)
-        totals.append(("v_ha", np.nan_to_num(kept.volume), _variance_of_sum(sigma, shared)))
+        totals.append(("v_ha", *_volumes(kept.volume, kept.volume_sigma, kept.volume_shared, basal)))
     for name, weights, variance in totals:
         total, squares = float(weights.sum()), float(np.square(weights).sum())
         se = math.sqrt((1.0 - share) * squares + variance)
@@ -296,6 +295,30 @@ def _basal_areas(trees: PlotTrees, common: float) -> tuple[Float, float]:
     of_all = np.where(known, shared, float(shared[known].mean()))
     own = float((np.square(error) - np.square(shared))[known].sum()) + missing * spread
     return np.where(known, basal, mean), own + float(of_all.sum()) ** 2
+
+
+def _volumes(volume: Float, sigma: Float, shared: Float | None, basal: Float) -> tuple[Float, float]:
+    """Return the volume of each tree, shape (T,) [m^3], and the variance of their sum [m^6].
+
+    It is a ratio estimator: a tree without a volume has the ratio of volume to basal area of the others, with
+    the variance of this ratio among them (of a single one its square). At least one tree has a volume, unless
+    there are no trees.
+
+    Args:
+        volume, sigma, shared: Volumes and parts of their errors, see PlotTrees.
+        basal: Basal area of each tree, shape (T,) [m^2].
+    """
+    known = np.isfinite(volume)
+    if not known.any():
+        return np.zeros(len(known)), 0.0
+    sigma = sigma[known]
+    common = np.zeros(len(sigma)) if shared is None else np.minimum(shared[known], sigma)
+    measured, missing = float(basal[known].sum()), basal[~known]
+    ratio = float(volume[known].sum()) / measured
+    spread = float((volume[known] / basal[known]).var(ddof=1)) if len(sigma) > 1 else ratio**2
+    variance = _variance_of_sum(sigma, common) * (float(basal.sum()) / measured) ** 2
+    variance += spread * (float(np.square(missing).sum()) + float(missing.sum()) ** 2 / len(sigma))
+    return np.where(known, volume, ratio * basal), variance
 
 
 def _threshold_variance(trees: PlotTrees, least: float, common: float) -> float:

@@ -247,23 +247,38 @@ def test_plots_together_have_their_weighted_mean_and_the_error_between_them():
     assert math.isnan(combined({"a": plots["a"]})["n_ha"].se)
 
 
-def test_volume_counts_the_trees_that_have_one():
+def test_trees_without_a_volume_have_the_mean_one_by_basal_area():
     trees = trees_of([0.2] * 12)
     volume = np.array([0.5] * 9 + [np.nan] * 3)
     with_volume = replace(trees, volume=volume, volume_sigma=np.where(np.isfinite(volume), 0.03, np.nan))
     f = figures(with_volume, area=1000.0)
     assert f.with_volume == 9
-    assert f.values["v_ha"] == (pytest.approx(45.0), pytest.approx(10.0 * 0.03 * 3.0))
-    assert f.values["v_ha_corrected"].value == pytest.approx(45.0)
+    assert f.values["v_ha"] == (pytest.approx(60.0), pytest.approx(10.0 * 0.03 * 3.0 * 12 / 9))
+    assert f.values["v_ha_corrected"].value == pytest.approx(60.0)
     assert any("volume of 9 of 12 trees" in text for text in f.warnings)
     half = figures(with_volume, area=1000.0, seen=500.0, detection=(0.5, 0.0))
-    assert half.values["v_ha"].value == pytest.approx(90.0)
-    assert half.values["v_ha_corrected"].value == pytest.approx(180.0)
+    assert half.values["v_ha"].value == pytest.approx(120.0)
+    assert half.values["v_ha_corrected"].value == pytest.approx(240.0)
     empty = figures(with_volume.where(np.zeros(12, np.bool_)), area=1000.0)
     assert empty.values["v_ha"] == (0.0, 0.0)
-    assert combined({"a": f, "b": empty})["v_ha"].value == pytest.approx(22.5)
+    assert combined({"a": f, "b": empty})["v_ha"].value == pytest.approx(30.0)
     assert figures(trees).with_volume is None
     assert math.isnan(figures(trees).values["v_ha"].value)
+
+
+def test_the_error_of_volumes_is_that_of_stands_of_which_some_heights_are_seen():
+    random = np.random.default_rng(6)
+    errors, told = [], []
+    for _ in range(400):
+        d = random.uniform(0.15, 0.45, 30)
+        true = 9.0 * np.square(d) * random.normal(1.0, 0.2, 30)
+        sigma = np.full(30, 0.02)
+        volume = np.where(random.random(30) < 0.5, true + random.normal(0.0, sigma), np.nan)
+        v = figures(replace(trees_of(d), volume=volume, volume_sigma=sigma)).values["v_ha"]
+        errors.append(v.value - 10.0 * true.sum())
+        told.append(v.se)
+    assert abs(np.mean(errors)) < 3 * np.std(errors) / 20
+    assert np.std(errors) == pytest.approx(math.sqrt(np.mean(np.square(told))), rel=0.12)
 
 
 def test_plain_figures_of_several_plots_refer_to_their_whole_area():
