@@ -111,8 +111,10 @@ function showLegend() {
   const shown = { truth: marked.length, other: others.length,
     hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
-  setText(byId("legend-truth"), byPeople ? `${ofRun ? "true or " : ""}annotated tree` : "true tree");
-  setText(byId("legend-other"), [...new Set(others.map(({ kind }) => `${verdictOf(kind)[0]} ${kind}`))].sort().join(", "));
+  setText(byId("legend-truth"), !byPeople ? "true tree" : ofRun ? "reference tree" : "annotated tree");
+  const kinds = [...new Set(others.map(({ kind }) => kind))].sort(), named = kinds.map((kind) => `${verdictOf(kind)[0]} ${kind}`).join(", ");
+  setText(byId("legend-other"), kinds.length > 1 ? `other: ${kinds.map((kind) => verdictOf(kind)[0]).join(" ")}` : named);
+  byId("legend-other").title = `No tree by the ground truth, an annotation or a repair: ${named}`;
   setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");
 }
 
