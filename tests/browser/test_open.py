@@ -130,5 +130,7 @@ def test_a_sensor_is_opened_by_the_form_and_its_run_is_recorded(page: Page, fold
     expect(page.locator("#recording")).to_contain_text("recording 0 MB")
     assert len(list(folder.glob("live-*.mcap"))) >= 1
     page.locator("#recording").click()
-    expect(page.locator("#recording")).to_be_hidden()  # no packet came, so that there is no file
+    expect(page.locator("#recording")).to_have_text("End recording?")
+    page.locator("#recording").click()
+    expect(page.locator("#recording")).to_have_text("○ Record")  # no packet came, so that there is no file
     assert not list(folder.glob("live-*.mcap"))
