@@ -166,7 +166,7 @@ export function startSceneAnnotating() {
       if (Math.hypot(event.clientX - down[0], event.clientY - down[1]) > STILL) return;
       const ray = rayAt(inner, event.clientX, event.clientY);
       const place = ray && placeOnRay(ray);
-      if (place) add({ x: Math.round(place.x * 1e4) / 1e4, y: Math.round(place.y * 1e4) / 1e4 });
+      if (place) addAt({ x: Math.round(place.x * 1e4) / 1e4, y: Math.round(place.y * 1e4) / 1e4 });
     }, { capture: true });
   });
 }
