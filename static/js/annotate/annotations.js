@@ -115,7 +115,7 @@ function arrived(serial) {
 }
 
 // The new annotation is chosen unless another tree was selected meanwhile.
-export async function add(content) {
+async function add(content) {
   const before = state.selected;
   const done = await edit(() => call("POST", "", { kind: "tree", dbh_cm: null, ...content }));
   if (done && state.selected === before) choose(done.id);
