@@ -464,7 +464,7 @@ def test_a_chosen_annotation_and_the_card_are_one_selection(person: Dashboard):
     assert [row["kind"] for row in rows(person)] == ["pole", "person"]
 
     # An added object without a tree has no card: the keys set its own class.
-    page.evaluate("import('/static/js/annotate/annotations.js').then(it => it.add({ x: 4, y: 30 }))")
+    page.evaluate("import('/static/js/annotate/annotations.js').then(it => it.addAt({ x: 4, y: 30 }))")
     expect(title).to_be_hidden()
     expect(page.locator("#annotate-hint")).to_contain_text("belongs to no found tree")
     assert page.evaluate(RINGS) == 1
