@@ -16,6 +16,7 @@ Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "sil
 
 _OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
+#: Count at the end of a warning, such as "scans lost on the network (3)".
 _COUNT = re.compile(r" \(\d+[^()]*\)$")
 _LONGEST = 300
 

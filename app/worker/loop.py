@@ -283,7 +283,7 @@ class WorkerLoop:
             case protocol.Pause():
                 self._held = True
                 self._show(session.pause())
-            case protocol.Record(path=path):
+            case protocol.BeginRecording(path=path):
                 session.start_recording(path)
             case protocol.EndRecording():
                 session.end_recording()

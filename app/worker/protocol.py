@@ -130,7 +130,7 @@ class Advance(msgspec.Struct, frozen=True, tag="advance"):
     scans: Annotated[int, Meta(ge=-MOST_SCANS, le=MOST_SCANS)] = 1
 
 
-class Record(msgspec.Struct, frozen=True, tag="record"):
+class BeginRecording(msgspec.Struct, frozen=True, tag="record"):
     """Record a live run from now on to a new file at this path; nothing if it is recorded."""
 
     path: str
@@ -199,7 +199,9 @@ class WorkerBusyError(StemmapError):
     """The worker is being restarted or does not answer in time. The same command may succeed later."""
 
 
-Command = Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open | Record | EndRecording | EndRun
+Command = (
+    Play | Pause | Advance | Seek | SetSpeed | SetParameters | Open | BeginRecording | EndRecording | EndRun
+)
 
 
 class Opened(msgspec.Struct, frozen=True, tag="opened"):

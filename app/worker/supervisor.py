@@ -126,7 +126,7 @@ class WorkerProcess:
         """
         if isinstance(command, protocol.SetParameters | protocol.SetSpeed):
             self._settings[type(command)] = command
-        elif isinstance(command, protocol.Record) and self._open is not None:
+        elif isinstance(command, protocol.BeginRecording) and self._open is not None:
             self._open = msgspec.structs.replace(self._open, record=command.path)
         elif isinstance(command, protocol.Open):
             self._open = command

@@ -185,8 +185,8 @@ def _fill_figures(
 
 @compiled_borrowing
 def one_sidedness(coverage: float, order: int) -> float:
-    """Return the mean of cos(order b) over views whose directions b show an observed arc [rad] together: from
-    1 for one view to 0 for views from all around."""
+    """Return the mean of cos(order b) over views in directions b that show an observed arc [rad] together: 1
+    for one view. From all around it is 0 in the second order, and 0.5, an upper bound, in the first."""
     w = min(order * 0.5 * max(coverage - ONE_VIEW, 0.0), np.pi)
     return np.sin(w) / w if w > 0.0 else 1.0
 

@@ -55,7 +55,7 @@ class _Pause(Body):
     type: Literal["pause"]
 
 
-class _Record(Body):
+class _BeginRecording(Body):
     type: Literal["record"]
 
 
@@ -93,7 +93,7 @@ class _SetSpeed(Body):
 
 
 _AnyCommand = Annotated[
-    _Play | _Pause | _Record | _EndRecording | _EndRun | _Advance | _Seek | _SetSpeed,
+    _Play | _Pause | _BeginRecording | _EndRecording | _EndRun | _Advance | _Seek | _SetSpeed,
     Field(discriminator="type"),
 ]
 
@@ -144,7 +144,7 @@ async def command(body: _AnyCommand, dashboard: Dash, settings: Deployment) -> R
     recording. The response is empty (202); the status reports the result. 422 for a recording of what is not
     live, 409 if there is no data folder for it, 503 if the worker is being restarted."""
     fields = body.model_dump()
-    if isinstance(body, _Record):
+    if isinstance(body, _BeginRecording):
         fields["path"] = _new_recording(dashboard.source.uri, settings)
     await dashboard.command(msgspec.convert(fields, Command))
     return json_reply({}, 202)

@@ -23,8 +23,8 @@ const MOST_ANSWERED = 20; // answers to which the review returns
 // takes about 300 ms from the picture to the key (Donders 1868, Hick 1952), but three answers per second leave 333 ms between two
 // keys, of which the next card needs a part.
 const LOOK = 150;
-// [ms] the same where another browser or a click in the scene chose the tree: an answer to the tree before may be on its way, and
-// nearly all choices between two answers are made within a second (Hick 1952).
+// [ms] the same where another browser or a click in the scene selected the tree: the answer to the tree before may be on its way. A
+// choice between up to ten answers takes less than a second (Hick 1952).
 const LOOK_UNASKED = 1000;
 // [ms] between two clicks on the answers that are one double click: the default of GTK (gtk-double-click-time).
 const DOUBLE_CLICK = 400;
@@ -125,7 +125,7 @@ async function add(content) {
 // An annotation, also that of a skipped tree.
 const storedRow = (id) => [...rows(), ...skips()].find((row) => row.id === id) ?? null;
 
-// Adds an annotation at a place {x, y}, unless one is there: two clicks mean one thing.
+// Adds an annotation at a place {x, y}, unless there is one within the distance at which two annotations are one thing.
 const placing = new Set();
 export async function addAt(place) {
   const within = state.annotations?.same_thing_m ?? 0;

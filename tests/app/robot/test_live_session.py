@@ -20,6 +20,7 @@ from app.worker.loop import WorkerLoop
 from app.worker.protocol import (
     Advance,
     Begin,
+    BeginRecording,
     EndRecording,
     EndRun,
     FromWorker,
@@ -27,7 +28,6 @@ from app.worker.protocol import (
     Opened,
     Pause,
     Play,
-    Record,
     Report,
     Seek,
     SetParameters,
@@ -241,7 +241,7 @@ def test_a_run_is_recorded_from_a_press_on_and_again_to_a_second_file(sending, d
     with stage() as on:
         link = mapped_link(on, sending)
         link.times.now_ns = lambda: link.inbox._arrived_fixed[0].log_ns + 1
-        on.commands.put(Record(str(path)))
+        on.commands.put(BeginRecording(str(path)))
         until(lambda: on.status.recording.startswith("recording run.mcap"))
         sending(link, 11, SCANS)
         until(lambda: on.shown[-1] == SCANS - 1)
@@ -251,7 +251,7 @@ def test_a_run_is_recorded_from_a_press_on_and_again_to_a_second_file(sending, d
         until(lambda: on.status.recording.startswith("recorded run.mcap"))
         assert on.status.recorded_file == str(path)
         assert on.status.state == "playing"
-        on.commands.put(Record(str(path)))
+        on.commands.put(BeginRecording(str(path)))
         until(lambda: on.status.recording.startswith("recording run-2.mcap"))
     with closing(open_source(str(path))) as recording, closing(open_source(str(drive))) as whole:
         known = recording.description
@@ -271,7 +271,7 @@ def test_what_waits_to_be_mapped_is_in_a_recording_that_begins_later(sending, tm
         on.commands.put(Pause())
         until(lambda: on.status.state == "paused")
         sending(link, 11, SCANS)
-        on.commands.put(Record(str(tmp_path / "run.mcap")))
+        on.commands.put(BeginRecording(str(tmp_path / "run.mcap")))
         until(lambda: on.status.recording.startswith("recording"))
     assert recorded_scans(tmp_path / "run.mcap") == SCANS - 11
 
@@ -280,7 +280,7 @@ def test_a_file_that_cannot_be_created_is_told_and_the_run_goes_on(sending, tmp_
     (tmp_path / "file").write_text("")
     with stage() as on:
         link = mapped_link(on, sending)
-        on.commands.put(Record(str(tmp_path / "file" / "run.mcap")))
+        on.commands.put(BeginRecording(str(tmp_path / "file" / "run.mcap")))
         until(lambda: on.status.recording.startswith("not recording: cannot record"))
         sending(link, 11, SCANS)
         until(lambda: on.shown[-1] == SCANS - 1)
