@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pipeline.errors import StemmapError
 from tests.benchmarks.table import Table
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 ROOT = Path(__file__).resolve().parents[2]
 LONGEST_S = 172_800.0  # a campaign or a soak of a day on a busy machine
@@ -51,6 +56,16 @@ def tables_of(name: str) -> list[Table]:
     if done.returncode != 0:
         raise StemmapError(f"the benchmark ended with code {done.returncode}", where=name)
     return [Table.from_json(value) for value in json.loads(done.stdout)]
+
+
+def on_cores(function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[tuple[Task, Result]]:
+    """Yield each task with its result in the order in which they end, as many at a time as there are cores
+    for this process. The function is one of a module. For benchmarks that do not measure wall time."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=context) as pool:
+        running = {pool.submit(function, task): task for task in tasks}
+        for done in as_completed(running):
+            yield running[done], done.result()
 
 
 class Side:

@@ -6,11 +6,13 @@ import os
 import re
 import sys
 import tempfile
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tests.benchmarks.process import on_cores
 from tests.benchmarks.seeds import chosen_seeds
 from tests.benchmarks.table import Cell, Table, verdict
 
@@ -30,6 +32,7 @@ STANDS = {
 }
 FELLED = 0.1
 MAP_SEED = 1
+EVO = Path("oxford_evo", "Evo.npz")  # another forest
 RECALL = "Wild_V03"  # the recording that TreeLoc++ reports
 RECALL_NOTE = (
     "Frames within 5 m of the path of the map; found: the best pose is within 5 m. Needed: 0.95. TreeLoc++ "
@@ -43,76 +46,140 @@ def run() -> list[Table]:
     """A table with simulated stands, and one with the recorded drives if they are there."""
     starts = int(os.environ.get("STEMMAP_BENCH_STARTS", STARTS))
     root = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
-    tables = _recorded(root, starts) if (root / "wild_places").is_dir() else []
-    return [*tables, _simulated(starts)]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(os.environ.get("STEMMAP_BENCH_MAPS", temporary))
+        tables = _recorded(root, starts, folder) if (root / "wild_places").is_dir() else []
+        return [*tables, _simulated(starts, folder)]
 
 
-def _simulated(starts: int) -> Table:
+def _start_in_stand(task: tuple[str, int, int, Path]) -> list[Start]:
+    """The results of one start by kind, seed, number and folder, in its own map and another."""
+    from tests.benchmarks.localise.drives import stand, stand_drive, wander
+    from tests.benchmarks.localise.starts import run_start
+
+    kind, seed, k, folder = task
+    way = wander(SIDE, 85.0, np.random.default_rng([seed, k]))
+    here = stand(seed, SIDE, **STANDS[kind])  # type: ignore[arg-type]
+    drive = stand_drive(kind, *here, way, 1000 * seed + k, felled=FELLED)
+    return run_start(drive, 0, k, _maps_of_stand(kind, seed, folder))
+
+
+@cache
+def _maps_of_stand(kind: str, seed: int, folder: Path) -> tuple[Reference, Reference]:
+    """The map of a stand, and that of another one of its kind."""
+    from tests.benchmarks.localise.drives import stand, stand_drive, sweep
+
+    here, other = (stand(s, SIDE, **STANDS[kind]) for s in (seed, seed + 1000))  # type: ignore[arg-type]
+    own = _kept(f"{kind}-{seed}", stand_drive(kind, *here, sweep(SIDE, LANE), seed), folder)
+    another = _kept(f"{kind}-{seed + 1000}", stand_drive(kind, *other, sweep(SIDE, LANE), seed), folder)
+    return own, _elsewhere(another)
+
+
+def _simulated(starts: int, folder: Path) -> Table:
     """Drives through the same stand on other ways, with one tree of ten felled, in its map and in the map of
     another stand of the same kind."""
-    from tests.benchmarks.localise.drives import stand, stand_drive, sweep, wander
-    from tests.benchmarks.localise.starts import COLUMNS, row_of, run_start
+    from tests.benchmarks.localise.starts import COLUMNS, row_of
 
+    seeds = chosen_seeds(SEEDS)
+    stands = [(kind, seed) for kind in STANDS for seed in seeds]
+    list(on_cores(_map_stand, [(*stand, folder) for stand in stands]))
+    tasks = [(*stand, k, folder) for stand in stands for k in range(-(-starts // len(seeds)))]
+    results = dict(on_cores(_start_in_stand, tasks))
     rows: list[tuple[Cell, ...]] = []
     everything: list[Start] = []
-    for kind, how in STANDS.items():
-        results: list[list[Start]] = [[], []]
-        for seed in chosen_seeds(SEEDS):
-            here, other = stand(seed, SIDE, **how), stand(seed + 1000, SIDE, **how)  # type: ignore[arg-type]
-            maps = [
-                _kept(f"{kind}-{seed}", stand_drive(kind, *here, sweep(SIDE, LANE), seed)),
-                _elsewhere(
-                    _kept(f"{kind}-{seed + 1000}", stand_drive(kind, *other, sweep(SIDE, LANE), seed))
-                ),
-            ]
-            for k in range(-(-starts // len(chosen_seeds(SEEDS)))):
-                way = wander(SIDE, 85.0, np.random.default_rng([seed, k]))
-                drive = stand_drive(kind, *here, way, 1000 * seed + k, felled=FELLED)
-                for result, start in zip(results, run_start(drive, 0, k, maps), strict=True):
-                    result.append(start)
-        for name, result in zip(("its own map", "map of another stand"), results, strict=True):
-            rows.append((kind, name, *row_of(result)))
-            print(*rows[-1], file=sys.stderr, flush=True)
-        everything += [start for result in results for start in result]
+    for kind in STANDS:
+        both = zip(*(results[task] for task in tasks if task[0] == kind), strict=True)
+        for name, of in zip(("its own map", "map of another stand"), both, strict=True):
+            rows.append((kind, name, *row_of(of)))
+            everything += of
     return Table("Simulated stands", ("stand", "in", *COLUMNS), tuple(rows), _notes(everything))
 
 
-def _recorded(root: Path, starts: int) -> list[Table]:
-    """Each drive of Wild-Places in each map, and in the map of another forest."""
-    from tests.benchmarks.localise.drives import recorded_drive
-    from tests.benchmarks.localise.starts import COLUMNS, LONGER, WITHIN, frames_found, row_of, run_start
+def _map_stand(task: tuple[str, int, Path]) -> None:
+    _maps_of_stand(*task)
 
-    drives = [recorded_drive(file.stem, file) for file in sorted((root / "wild_places").glob("*.npz"))]
-    maps = [_kept(drive.name, drive) for drive in drives]
-    evo = root / "oxford_evo" / "Evo.npz"
-    others = [_elsewhere(_kept("Evo", recorded_drive("Evo", evo)))] if evo.is_file() else []
-    rows: list[tuple[Cell, ...]] = []
-    everything: list[Start] = []
-    for drive in drives:
-        stored_drives = [None if other is drive else other for other in drives] + [None] * len(others)
+
+@cache
+def _recordings(root: Path, folder: Path) -> tuple[list[Drive], list[Reference]]:
+    """The drives of Wild-Places, and their maps followed by that of another forest."""
+    from tests.benchmarks.localise.drives import recorded_drive
+
+    drives = [recorded_drive(file.stem, file) for file in _recording_files(root)]
+    maps = [_kept(drive.name, drive, folder) for drive in drives]
+    if (evo := root / EVO).is_file():
+        maps.append(_elsewhere(_kept("Evo", recorded_drive("Evo", evo), folder)))
+    return drives, maps
+
+
+def _recording_files(root: Path) -> list[Path]:
+    return sorted((root / "wild_places").glob("*.npz"))
+
+
+def _map_recording(task: tuple[Path, Path]) -> None:
+    """Map a recording into a folder."""
+    from tests.benchmarks.localise.drives import recorded_drive
+
+    file, folder = task
+    _kept(file.stem, recorded_drive(file.stem, file), folder)
+
+
+def _start_of(task: tuple[Path, Path, int, int, int]) -> list[Start]:
+    """The results in all maps of one start, by root, folder, number of the drive, first frame and seed."""
+    from tests.benchmarks.localise.starts import run_start
+
+    root, folder, number, begin, seed = task
+    drives, maps = _recordings(root, folder)
+    stored_drives = [None if k == number or k >= len(drives) else drives[k] for k in range(len(maps))]
+    return run_start(drives[number], begin, seed, maps, stored_drives)
+
+
+def _frames_of(task: tuple[Path, Path, int, int]) -> tuple[int, int]:
+    """`frames_found` by root, folder, number of the drive and of the map."""
+    from tests.benchmarks.localise.starts import frames_found
+
+    root, folder, number, stored = task
+    drives, maps = _recordings(root, folder)
+    return frames_found(drives[number], maps[stored])
+
+
+def _recorded(root: Path, starts: int, folder: Path) -> list[Table]:
+    """Each drive of Wild-Places in each map, and in the map of another forest."""
+    from tests.benchmarks.localise.starts import COLUMNS, LONGER, WITHIN, row_of
+
+    evo = root / EVO
+    files = [*_recording_files(root), *([evo] if evo.is_file() else [])]
+    for (file, _), _ in on_cores(_map_recording, [(file, folder) for file in files]):
+        print(f"mapped {file.stem}", file=sys.stderr, flush=True)
+    drives, maps = _recordings(root, folder)
+    tasks = list[tuple[Path, Path, int, int, int]]()
+    for number, drive in enumerate(drives):
         rng = np.random.default_rng(len(drive.poses))
         last = int(np.searchsorted(drive.driven, drive.driven[-1] - WITHIN - LONGER))
-        results: list[list[Start]] = [[] for _ in [*maps, *others]]
-        for k, begin in enumerate(rng.integers(0, last, starts).tolist()):
-            for result, start in zip(
-                results, run_start(drive, begin, 1000 + k, [*maps, *others], stored_drives), strict=True
-            ):
-                result.append(start)
-        for stored, result in zip([*maps, *others], results, strict=True):
-            rows.append((drive.name, stored.name, *row_of(result)))
-            print(*rows[-1], file=sys.stderr, flush=True)
-        everything += [start for result in results for start in result]
+        begins = rng.integers(0, last, starts).tolist()
+        tasks += [(root, folder, number, begin, 1000 + k) for k, begin in enumerate(begins)]
+    results = dict[tuple[Path, Path, int, int, int], list[Start]]()
+    for task, result in on_cores(_start_of, tasks):
+        results[task] = result
+        if len(results) % 50 == 0:
+            print(f"{len(results)} of {len(tasks)} ways", file=sys.stderr, flush=True)
+    rows: list[tuple[Cell, ...]] = []
+    everything: list[Start] = []
+    for number, drive in enumerate(drives):
+        for stored, of in zip(
+            maps, zip(*(results[t] for t in tasks if t[2] == number), strict=True), strict=True
+        ):
+            rows.append((drive.name, stored.name, *row_of(of)))
+            everything += of
     sizes = [
         (m.name, len(m.stored), size := len(m.stored.as_bytes()) / 1e3, 1e3 * size / float(d.driven[-1]))
-        for m, d in zip(maps, drives, strict=True)
+        for m, d in zip(maps, drives, strict=False)
     ]
-    frames = list[tuple[Cell, ...]]()
-    for drive in drives:
-        if drive.name == RECALL:
-            for stored in maps:
-                if stored.name != drive.name:
-                    found, of = frames_found(drive, stored)
-                    frames.append((drive.name, stored.name, found, of, found / max(of, 1)))
+    recall = [k for k, drive in enumerate(drives) if drive.name == RECALL]
+    pairs = [(root, folder, k, m) for k in recall for m in range(len(drives)) if m != k]
+    told = dict(on_cores(_frames_of, pairs))
+    frames = tuple(
+        (RECALL, maps[pair[3]].name, *told[pair], told[pair][0] / max(told[pair][1], 1)) for pair in pairs
+    )
     note = "Needed: 100 kB per kilometre. The files have no terrain, because these recordings have none."
     offset = (
         "The true poses of the drives share a frame only to 0.5 m, with errors that differ by 0.1 to 0.2 m "
@@ -121,7 +188,7 @@ def _recorded(root: Path, starts: int) -> list[Table]:
     )
     return [
         Table("Wild-Places", ("drive", "in", *COLUMNS), tuple(rows), (*_notes(everything), offset)),
-        Table("Single frames", ("frames", "in", "found", "of", "recall@1"), tuple(frames), (RECALL_NOTE,)),
+        Table("Single frames", ("frames", "in", "found", "of", "recall@1"), frames, (RECALL_NOTE,)),
         Table("Size of a stored map", ("map", "stems", "kB", "kB/km"), tuple(sizes), (note,)),
     ]
 
@@ -141,17 +208,14 @@ def _notes(starts: list[Start]) -> tuple[str, ...]:
     )
 
 
-def _kept(name: str, drive: Drive) -> Reference:
-    """Return the map of a drive. With STEMMAP_BENCH_MAPS it is kept in that folder and read again there."""
+def _kept(name: str, drive: Drive, folder: Path) -> Reference:
+    """Return the map of a drive, which is kept in a folder and read again there."""
     from tests.benchmarks.localise.drives import Reference
 
-    folder = os.environ.get("STEMMAP_BENCH_MAPS")
-    with tempfile.TemporaryDirectory() as temporary:
-        file = Path(folder or temporary) / f"{re.sub(r'[^-A-Za-z0-9_]+', '_', name)}.npz"
-        if not file.is_file():
-            print(f"mapping {name}", file=sys.stderr, flush=True)
-            drive.map(MAP_SEED).save(file)
-        return Reference.load(drive.name, file)
+    file = folder / f"{re.sub(r'[^-A-Za-z0-9_]+', '_', name)}.npz"
+    if not file.is_file():
+        drive.map(MAP_SEED).save(file)
+    return Reference.load(drive.name, file)
 
 
 def _elsewhere(reference: Reference) -> Reference:

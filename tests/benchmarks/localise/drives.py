@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from app.extensions.formats.tree_manager import STEM_FINDER
 from app.extensions.maps.localisation import StoredMap
+from app.extensions.maps.localisation.search import MapIndex
 from pipeline.config import preset
 from pipeline.geometry.poses import Float, Pose2, Pose3
 from pipeline.loop_closure.stem_matching import aligned
@@ -22,6 +23,7 @@ from tests.benchmarks.tree_manager_folder import perturbed, read_recorded
 
 #: Of the made odometry, as in the benchmark `oxford`: part of a step's length, rad/sqrt(m), rad/m.
 DISTANCE, TURN, BIAS = 0.02, np.radians(0.5), np.radians(0.02)
+SLACK = 0.1  # m; distortion of a map, as in `Localiser`
 NEAR = 25.0  # m; true poses of the stored drive that give the frame of its map at a place
 
 
@@ -91,12 +93,17 @@ class Drive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """A stored map, with the true and the estimated poses x, y [m], yaw [rad] of its drive, shape (F, 3)."""
+    """A stored map and its index, with the true and the estimated poses x, y [m], yaw [rad] of its drive,
+    shape (F, 3)."""
 
     name: str
     stored: StoredMap
     truth: Float
     path: Float
+    index: MapIndex = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "index", MapIndex.of(self.stored, SLACK))
 
     def covers(self, places: Float, within: float = 10.0) -> bool:
         """Return whether the drive passed near each true position, shape (N, 2) [m]."""

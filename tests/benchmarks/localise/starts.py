@@ -11,9 +11,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from app.extensions.maps.localisation import Localiser, State
-from app.extensions.maps.localisation.search import MapIndex, search_map
+from app.extensions.maps.localisation.search import search_map
 from pipeline.loop_closure.stem_matching import MapStems
-from tests.benchmarks.localise.drives import Drive, Reference, frame_offsets
+from tests.benchmarks.localise.drives import SLACK, Drive, Reference, frame_offsets
 
 WITHIN = 60.0  # m of driving
 LONGER = 20.0  # m, in which a fix is followed
@@ -70,7 +70,7 @@ def run_start(
     offsets = [
         np.zeros((end - begin, 3)) if of is None else frame_offsets(drive, of, begin, end) for of in drives
     ]
-    localisers = [Localiser(reference.stored) for reference in references]
+    localisers = [Localiser(reference.stored, SLACK, index=reference.index) for reference in references]
     starts = [Start(reference.covers(truth[begin:end, :2])) for reference in references]
     errors: list[list[tuple[float, float]]] = [[] for _ in references]
     for frame, stamp_ns, pose, trees, view in drive.mapped(begin, end, seed):
@@ -107,7 +107,7 @@ def run_start(
 
 REVISIT = 5.0  # m; TreeLoc++ counts a place within it as found
 SEEN = 30.0  # m around the robot, in which the stems of a single frame are
-SIGMA, SLACK = 0.05, 0.1  # m; of a stem, and the distortion of the map, as in `Localiser`
+SIGMA = 0.05  # m; of a stem
 LEVEL = 1e-6  # of false alarms; the best pose is counted without its test
 
 
@@ -118,7 +118,7 @@ def frames_found(drive: Drive, reference: Reference) -> tuple[int, int]:
     A frame is levelled by its true roll and pitch, as by gravity. The best pose of a search counts as found
     within REVISIT, whether or not the search accepts it (recall@1).
     """
-    index = MapIndex.of(reference.stored, SLACK)
+    index = reference.index
     found = of = 0
     for k, truth in enumerate(drive.truth):
         there = reference.there(truth)

@@ -125,14 +125,15 @@ class Localiser:
     Args:
         stored: The map.
         slack: Standard deviation of the distortion of a map within a constellation [m].
+        index: Index of the map with this slack, to share it among localisers; it is made if None.
     """
 
-    def __init__(self, stored: StoredMap, slack: float = 0.1) -> None:
+    def __init__(self, stored: StoredMap, slack: float = 0.1, *, index: MapIndex | None = None) -> None:
         """Prepare the search; a map without stems is never found."""
         self.stored = stored
         self.localisation = Localisation()
         self._slack = slack
-        self._index = MapIndex.of(stored, slack) if len(stored) else None
+        self._index = (index or MapIndex.of(stored, slack)) if len(stored) else None
         self._terrain = cKDTree(stored.terrain[:, :2]) if len(stored.terrain) else None
         self._stamp_ns: list[int] = []
         self._driven: list[float] = []
