@@ -541,8 +541,8 @@ def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[s
 
 def row_payload(row: Annotation) -> dict[str, Any]:
     """Return an annotation of an object as a dict of JSON values for the dashboard: `id`, `x` and `y` in the
-    map [m], `kind`, `dbh_cm` (None if unknown), `who`, `at_s` (time of the last edit [s since 1970]) and
-    `version`."""
+    map [m], `kind`, `dbh_cm` (None if unknown), `who`, `at_s` (time of the last edit [s since 1970], to
+    the millisecond) and `version`."""
     content = row.content
     return {
         "id": row.id,
@@ -551,7 +551,7 @@ def row_payload(row: Annotation) -> dict[str, Any]:
         "kind": content.kind,
         "dbh_cm": None if content.dbh is None else round(100.0 * content.dbh, 2),
         "who": row.who,
-        "at_s": row.at_ns // 1_000_000_000,
+        "at_s": round(row.at_ns / 1e9, 3),
         "version": row.version,
     }
 

@@ -224,7 +224,7 @@ def _row(row: dict[str, Any]) -> list[str]:
 
 def _when(row: dict[str, Any]) -> str:
     """Return the time of the last edit of an annotation, see `_rows`, as text."""
-    return moment(row["at_s"] * 1_000_000_000)
+    return moment(round(row["at_s"] * 1e9))
 
 
 def _key(content: Content) -> tuple[float, float, str]:

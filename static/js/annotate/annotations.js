@@ -39,7 +39,6 @@ export const draft = {
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
   shownAt: Infinity, // [ms] time since which it is on the screen
   answer: null, // {number, kind} of the last answer of the review
-  answered: [], // numbers of the trees that were answered, the newest last
   error: "",
   refused: "", // why the last answer did not count
   undo: {}, // numbers of edits that can be undone, by their subject
@@ -335,8 +334,6 @@ async function answer(tree, kind, fields = {}, goesOn = true) {
   }
   answering.add(number);
   Object.assign(draft, { answer: { number, kind }, kind: "other", refused: "" });
-  const before = draft.answered;
-  draft.answered = [...before.filter((each) => each !== number), number].slice(-MOST_ANSWERED);
   const stored = edit(async () => {
     const row = annotationOf(tree); // after the edits before this one
     const isSeen = row && row.id === seen?.id && row.version === seen.version;
@@ -347,10 +344,7 @@ async function answer(tree, kind, fields = {}, goesOn = true) {
   const given = draft.answer;
   try {
     if (goesOn && state.selected === number) await next();
-    if (!await stored) {
-      if (draft.answer === given) draft.answer = null; // not that of a later tree
-      if (!before.includes(number)) draft.answered = draft.answered.filter((each) => each !== number);
-    }
+    if (!await stored && draft.answer === given) draft.answer = null; // not that of a later tree
   } finally {
     answering.delete(number);
     news();
@@ -417,8 +411,16 @@ export function previous() {
   if (tree) lookAt(tree);
 }
 
-// The answered trees of the map, the newest last; those whose answer was undone are open again.
-export const answeredTrees = () => draft.answered.map(treeOf).filter((tree) => tree && (annotationOf(tree) || answering.has(tree.number)));
+// The last trees of the map that this person answered, the newest last.
+export function answeredTrees() {
+  const mine = [...rows(), ...skips()].filter(({ who }) => who === myName()).sort((a, b) => a.at_s - b.at_s).map(treeNumberOf);
+  const numbers = new Set();
+  for (const number of [...mine, ...answering]) {
+    numbers.delete(number);
+    numbers.add(number);
+  }
+  return [...numbers].map(treeOf).filter(Boolean).slice(-MOST_ANSWERED);
+}
 
 // What the last answer of the review said ("Tree 40: pole"); "" before the first one.
 export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${draft.answer.kind}${draft.answer.isStored ? ", as before" : ""}` : "");
@@ -503,7 +505,7 @@ export function startAnnotating() {
   on("annotations", () => {
     if (state.annotations.run !== run) {
       run = state.annotations.run;
-      Object.assign(draft, { moved: null, error: "", answer: null, answered: [] });
+      Object.assign(draft, { moved: null, error: "", answer: null });
       versions.clear();
       votes = NO_VOTES;
       updateUndo();

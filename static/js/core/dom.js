@@ -28,15 +28,16 @@ export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
-export function remember(key, value) {
+// In "localStorage" for the browser, in "sessionStorage" for this window.
+export function remember(key, value, storage = "localStorage") {
   try {
-    localStorage.setItem(`stemmap.${key}`, value);
+    window[storage].setItem(`stemmap.${key}`, value);
   } catch { /* a private window stores nothing */ }
 }
 
-export function recall(key) {
+export function recall(key, storage = "localStorage") {
   try {
-    return localStorage.getItem(`stemmap.${key}`);
+    return window[storage].getItem(`stemmap.${key}`);
   } catch {
     return null;
   }

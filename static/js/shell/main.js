@@ -39,9 +39,9 @@ import { startPalette } from "./palette.js";
 import { startSettings } from "./settings.js";
 import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
-import { startDrawer, startTabs } from "./tabs.js";
+import { restoreTab, startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startLayout, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startRepairPanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startWelcome, startShare, startUnits, startExtensions]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startWelcome, startShare, startUnits, startExtensions, restoreTab]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

@@ -17,6 +17,7 @@ export function openTab(name) {
     tab.tabIndex = each === name ? 0 : -1;
     byId(`panel-${each}`).hidden = each !== name;
   }
+  remember("tab", name, "sessionStorage");
   changed("tab");
 }
 
@@ -42,6 +43,12 @@ export function startTabs() {
       byId(`tab-${next}`).focus();
     });
   }
+}
+
+// Opens the tab that was open before this window was loaded again.
+export function restoreTab() {
+  const name = recall("tab", "sessionStorage");
+  if (NAMES.includes(name)) openTab(name);
 }
 
 export function startDrawer() {
