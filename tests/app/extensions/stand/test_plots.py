@@ -215,6 +215,17 @@ def test_cells_of_unknown_distance_do_not_change_the_detection():
     assert figures["all"].values["n_ha"].value == pytest.approx(len(position) / 0.06)
 
 
+def test_a_field_beside_the_stand_is_no_stand_of_missed_trees():
+    """All trees of a stand 16 m wide are found from a path in its middle, which sees 15 m to each side."""
+    seen = area_of([[x, y] for x in range(120) for y in range(-30, 30)])
+    seen = replace(seen, nearest=np.abs(seen.centres[:, 1]))
+    functions = []
+    for seed in range(40):
+        places = np.random.default_rng(seed).uniform([0.0, -8.0], [60.0, 8.0], (96, 2))
+        functions.append(detection_function(PlotTrees(places, np.full(96, 0.2), np.zeros(96)), seen, Stand()))
+    assert np.mean([math.isinf(f.sigma) for f in functions]) >= 0.9, "5 % of complete stands seem incomplete"
+
+
 def test_cells_that_stems_and_their_undergrowth_hide_are_observed():
     """Without them a stand lost the trees that stand in undergrowth, but hardly any area."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(20), np.arange(20)))
