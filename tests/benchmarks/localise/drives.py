@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,8 @@ class Drive:
         poses: True poses, one per frame.
         first: Row of the first stem of each frame, and the number of all stems, shape (F + 1,).
         stems: Positions, shape (N, 3) [m]; axis, shape (N, 3); dbh, shape (N,) [m].
+        truth: True x, y [m], yaw [rad] of each frame, shape (F, 3).
+        driven: Distance driven at each frame, shape (F,) [m].
     """
 
     name: str
@@ -44,16 +47,14 @@ class Drive:
     poses: list[Pose3]
     first: Int
     stems: tuple[Float, Float, Float]
+    truth: Float = field(init=False)
+    driven: Float = field(init=False)
 
-    @property
-    def truth(self) -> Float:
-        """True x, y [m], yaw [rad] of each frame, shape (F, 3)."""
-        return np.array([pose.planar().as_array() for pose in self.poses])
-
-    @property
-    def driven(self) -> Float:
-        """Distance driven at each frame, shape (F,) [m]."""
-        return np.append(0.0, np.cumsum(np.hypot(*np.diff(self.truth[:, :2], axis=0).T)))
+    def __post_init__(self) -> None:
+        truth = np.array([pose.planar().as_array() for pose in self.poses])
+        object.__setattr__(self, "truth", truth)
+        steps = np.hypot(*np.diff(truth[:, :2], axis=0).T)
+        object.__setattr__(self, "driven", np.append(0.0, np.cumsum(steps)))
 
     def seen(self, k: int, reach: float = 15.0) -> Float:
         """Return the stems of a frame within `reach` [m] by its true pose, shape (S, 2) [m]."""
@@ -139,7 +140,8 @@ def frame_offsets(live: Drive, stored: Drive, begin: int, end: int) -> Float:
     The common frame of recorded drives has errors that differ from place to place. They are measured in the
     frames alone, by the stems around each place at the true poses of both drives, and interpolated.
     """
-    rows = np.unique(np.append(np.arange(begin, end, OFFSET_EVERY), end - 1))
+    after = min(end + OFFSET_EVERY - 1, len(live.poses))
+    rows = np.arange(begin - begin % OFFSET_EVERY, after, OFFSET_EVERY)
     known = [(k, offset) for k in rows.tolist() if (offset := _frame_offset(live, stored, k)) is not None]
     if not known:
         return np.full((end - begin, 3), np.nan)
@@ -155,6 +157,7 @@ AROUND = 6  # frames before and after a place whose stems are compared
 LARGEST = 1.5  # m; the offset is below it
 
 
+@cache
 def _frame_offset(live: Drive, stored: Drive, k: int) -> Float | None:
     """Return `frame_offsets` at a frame: the most frequent shift of the stems, then pairs and alignments."""
     at = live.truth[k, :2]
