@@ -157,7 +157,7 @@ def _recorded(root: Path, starts: int, folder: Path) -> list[Table]:
         last = int(np.searchsorted(drive.driven, drive.driven[-1] - WITHIN - LONGER))
         begins = rng.integers(0, last, starts).tolist()
         tasks += [(root, folder, number, begin, 1000 + k) for k, begin in enumerate(begins)]
-    results = dict[tuple[Path, Path, int, int, int], list[Start]]()
+    results: dict[tuple[Path, Path, int, int, int], list[Start]] = {}
     for task, result in on_cores(_start_of, tasks):
         results[task] = result
         if len(results) % 50 == 0:
