@@ -1,4 +1,4 @@
-"""SLAM: the path of the robot and the landmarks that it was found by (Eq. 5-7)."""
+"""SLAM: the path of the robot and the landmarks from which it is estimated (Eq. 5-7)."""
 
 from pipeline.slam.fastslam import FastSlam
 from pipeline.slam.keyframe_graph import KeyframeGraph, Loop

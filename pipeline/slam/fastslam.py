@@ -2,8 +2,8 @@
 
 p(x_1:t, m | z_1:t, u_1:t) = p(x_1:t | z_1:t, u_1:t) prod_l p(m_l | x_1:t, z_1:t)         (Eq. 5)
 
-The path is carried by particles that move with the odometry and its noise (Eq. 6); given a path the
-landmarks are independent, so each particle keeps a small Kalman filter a landmark (Eq. 7).
+The path is represented by particles that move with the odometry and its noise (Eq. 6). Given a path, the
+landmarks are independent, so each particle has a small Kalman filter per landmark (Eq. 7).
 """
 
 from __future__ import annotations
@@ -753,7 +753,8 @@ def _estimate(
         shared = state.shared.moved(state.motion, state.motion_covariance)
         by_landmarks = covariance if by_trees else None
         if not by_trees and len(shared.by_trees):
-            # Without trees in view, the covariance by the last trees holds, enlarged by the odometry since.
+            # Without trees in view, the covariance by the last trees is used, enlarged by the odometry since
+            # then.
             by_landmarks = at_least(spread, shared.by_trees, NOISE / np.sqrt(n_eff))
         covariance, frame = frame.with_measured_pose(spread, n_eff, shared.joint[:3, :3], by_landmarks)
     reported = mean

@@ -6,9 +6,9 @@ the odometry moves its landmarks instead of the robot, scan by scan. All trees t
 odometry at once: the rigid motion that fits the detections to the landmarks (least squares over the pairs
 that agree) exceeds the errors of odometry and trees.
 
-People who walk side by side look the same. Only landmarks that stood for a while may therefore vote, in a
-place where most detections are such landmarks; otherwise more pairs are required than people walk together. A
-pair that agrees with the odometry and not with the motion refutes it.
+People who walk side by side cause the same shift. Therefore only landmarks that were known for a while may
+vote, at a place where most detections are such landmarks. Otherwise, more pairs are required than the number
+of people who walk together. A pair that agrees with the odometry and not with the motion refutes it.
 """
 
 from __future__ import annotations
