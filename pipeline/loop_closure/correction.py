@@ -67,7 +67,7 @@ class LoopClosure:
     Attributes:
         loop: The constraints of the path.
         stems: Number of trees by which a lost robot was located; None if it was not lost.
-        is_doubled: Whether the known trees stand a second time in the map, beside the first one.
+        is_doubled: Whether the known trees are mapped a second time, next to the first ones.
     """
 
     loop: Loop
@@ -103,7 +103,7 @@ class Smoothing:
 
 @dataclass(frozen=True, slots=True)
 class SearchFailure:
-    """A lost robot was not found in the map. Mapping goes on where the odometry leads."""
+    """A lost robot was not found in the map. Mapping continues at the pose by odometry."""
 
     @property
     def messages(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Kidnapped robot: a robot that was carried away is noticed, and found again in the map.
 
-While it is lost, the stems around it are mapped apart from the map. Once their constellation is found among
-the trees of the map, mapping goes on there.
+While it is lost, the stems around it are mapped separately from the map. When their constellation is found
+among the trees of the map, mapping continues there.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ S = TypeVar("S")
 SPACING = 5
 PARTICLES = 30  # of the local map
 HYPOTHESES = 100_000
-FARTHEST = 100.0  # m; after so long a search the map goes on where the odometry leads
+FARTHEST = 100.0  # m; after a search of this length, mapping continues at the pose by odometry
 LOCAL_MAP = 1  # spawn key of the random numbers of the local map
 
 
@@ -39,7 +39,7 @@ class RelocaliserState(Generic[S]):
             and the state.
         views: Number of views at the newer stored state.
         motions: Scan number and motion of each scan after the older stored state.
-        local: Local map of a search; None while the robot knows where it is.
+        local: Local map of a search; None while the robot is not lost.
         driven: Distance driven since the search began [m].
         since: First scan that mapped nothing because the robot was lost.
     """

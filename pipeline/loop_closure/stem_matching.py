@@ -5,10 +5,10 @@ Hypotheses of a pose align each pair of local stems with each pair of the map of
 the map are sorted by length. Each hypothesis is verified by the number of other stems that find a partner.
 The search covers the whole map, so that the second best pose is known as well.
 
-A wrong loop ruins a map, a missed one costs little. A pose is accepted only if (1) enough stems agree, (2) so
-many would not agree by chance, by the number of false alarms of the a contrario method (Desolneux, Moisan,
-Morel 2000), (3) no other pose explains nearly as many, as in the regular grid of a plantation, and (4) the
-stems that agree determine the pose well.
+A wrong loop makes a map useless, whereas a missed loop has little effect. A pose is accepted only if (1)
+enough stems agree, (2) so many would not agree by chance, by the number of false alarms of the a contrario
+method (Desolneux, Moisan, Morel 2000), (3) no other pose explains nearly as many, as in the regular grid of a
+plantation, and (4) the stems that agree determine the pose well.
 """
 
 from __future__ import annotations
