@@ -1,12 +1,12 @@
 """Localisation of a driving robot in a stored map: global search, then tracking, and withdrawal of a fix that
 the stems contradict.
 
-The robot is mapped apart from the stored map, in the frame `odom`: that of its own map or odometry. While it
-is not found, the stems of the last metres are searched in the stored map (`search`). A fix gives T_map_odom.
-It is followed as in a Kalman filter: the drift since the last alignment makes it uncertain, and the stems in
-view, paired within that uncertainty, correct it. A few stems that agree by chance elsewhere therefore cannot
-move it. While fewer of the stems in view agree than at a known place, no pose is given; the fix is withdrawn
-when their odds decide.
+The run is mapped separately from the stored map, in the frame `odom` of its own map or odometry. While the
+robot is not found, the stems of the last metres are searched for in the stored map (`search`). A fix gives
+T_map_odom. It is updated as in a Kalman filter: the drift since the last alignment increases its covariance,
+and the stems in view, paired within this covariance, correct it. A few stems that agree by chance elsewhere
+therefore cannot move it. While fewer of the stems in view agree than at a known place, no pose is given. The
+fix is withdrawn when the cumulative log odds contradict it.
 
 The stored map is never changed.
 """
@@ -76,7 +76,7 @@ class Localisation:
             stems of the map; zeros unless found.
         stems, of: Number of stems that agree, and of stems that are where the map has stems.
         residual: Root mean square distance of the stems that agree [m]; NaN without any.
-        height: Height and tilt of the local frame; None if the maps do not tell.
+        height: Height and tilt of the local frame; None if unknown.
         driven: Distance driven [m].
         found_at: Distance driven when it was found [m]; NaN unless found.
         searches: Number of searches.
@@ -161,7 +161,7 @@ class Localiser:
             T_odom_base: Pose of the robot in the local frame.
             trees: The local map, in the local frame. Only confirmed trees count.
             terrain: x, y, z of the cells of the local terrain, shape (K, 3) [m]; None if unknown.
-            view: Trees of the scan in the base frame, which tell where the robot is now even if its pose in
+            view: Trees of the scan in the base frame, which determine the present pose even if the pose in
                 the local map has slipped; None takes the trees of the local map that were seen last.
         """
         self._view = view
@@ -308,7 +308,7 @@ class Localiser:
         )
 
     def _in_view(self, trees: Trees) -> MapStems:
-        """Return the stems that tell where the robot is now, in the local frame."""
+        """Return the stems that determine the present pose, in the local frame."""
         view = self._view
         if view is None:
             return _stems(trees, self._recent(trees, RECENT)[:MOST_STEMS])

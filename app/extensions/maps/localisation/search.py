@@ -12,9 +12,9 @@ The fix is accepted if its agreement is not chance: the number M of alignments t
 probability that as many stems of a wrong pose agree, M P(Binomial(n, p) >= k), is at most the level (number
 of false alarms of the a contrario method, Desolneux, Moisan, Morel 2000). p is the chance that a stem agrees,
 from the density of the map; or, if it is larger, the chance that explains the second best pose as the best of
-M wrong ones, M P(Binomial(n, p) >= k2) = 1. The second best pose therefore tells the chance of this stand: it
-is high where stems stand in rows, and the fitting of the pose is included. The best pose must beat it by the
-same test.
+M wrong ones, M P(Binomial(n, p) >= k2) = 1. The second best pose is therefore an estimate of the chance in
+this stand: it is high where stems stand in rows, and it includes the fitting of the pose. The best pose must
+exceed the second best pose by the same test.
 """
 
 from __future__ import annotations
