@@ -17,8 +17,8 @@ FEW_TREES = 10
 HECTARE = 1e4  # m^2
 REINEKE = 1.605
 INCH_10 = 25.4  # cm
-# Share of the value below which the known parts of an error say nothing: the trees that the map lacks, which
-# are not among them, are then the larger part.
+# Share of the value below which a standard error is "not known": it does not include the trees that the map
+# lacks, which would then be its larger part.
 NEGLIGIBLE = 0.001
 # Probability of as many trees outside of the observed part, if the parts are alike, below which they are not:
 # three standard deviations of a normal distribution, one-sided.
