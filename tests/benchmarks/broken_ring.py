@@ -1,9 +1,9 @@
-"""A broken ring for people to mend: `python -m tests.benchmarks.broken_ring FOLDER [SEED]`.
+"""A broken ring for people to repair: `python -m tests.benchmarks.broken_ring FOLDER [SEED]`.
 
-The folder has the scans of the ring as ready stems, in the format of `app.extensions.formats.tree_manager`.
-Beside it, FOLDER.txt lists the ten faults of its map as a person who knows the stand names them, and
-FOLDER.csv has the true trees, in metres from the start of the drive, which looks along x. The map is broken
-where no loop is closed: `stemmap FOLDER --set relocalisation.method=none`.
+The folder contains the scans of the ring as detected stems, in the format of
+`app.extensions.formats.tree_manager`. Next to it, FOLDER.txt lists the ten faults of the map in the words of
+a person who knows the stand, and FOLDER.csv contains the true trees, in metres in the frame of the first
+pose. The map is broken if no loop is closed: `stemmap FOLDER --set relocalisation.method=none`.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from tests.benchmarks.wide_ring import WideRing
 
 POLES = np.array([[8.0, 3.0], [16.0, -2.5], [22.0, 10.0]])
 GHOSTS = np.array([[3.0, -3.0], [14.0, 6.5]])
-TWIN = np.array([0.2, 0.1])  # m, between two stems that are one in the map
+TWIN = np.array([0.2, 0.1])  # m, between two stems that are one tree in the map
 DOUBLE = np.array([0.9, 0.0])  # m, between a stem and its false copy
 CLEAR = 2.0  # m, of other stems around each fault
 
 
 @dataclass(frozen=True, slots=True)
 class FaultyRing(WideRing):
-    """A ring with poles, ghosts, two false copies of trees, and a tree with a twin."""
+    """A ring with poles, false trees, two false copies of trees, and a tree with two stems."""
 
     def scene(self, random: np.random.Generator) -> tuple[Float, Float, Float]:
         """Return the true trees, those with a false copy, and the one with a twin."""
@@ -78,7 +78,7 @@ def lifted(pose: Pose2) -> Pose3:
 
 
 def faults(copied: Float, twin: Float) -> list[str]:
-    """The faults in words, with true places [m]."""
+    """Return descriptions of the faults with true positions [m]."""
     lines = [
         "Places are surveyed from the start of the drive; the map shows them up to some metres beside.",
         "The end of the drive passes the trees of its start again, but the map shows them a second time.",

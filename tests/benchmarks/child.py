@@ -1,4 +1,4 @@
-"""A benchmark's own process: `python -m tests.benchmarks.child NAME` prints its tables as JSON."""
+"""Process of one benchmark: `python -m tests.benchmarks.child NAME` prints its tables as JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TextIO
 
 
 def answers() -> TextIO:
-    """The pipe to the parent. Libraries that print to stdout reach stderr from now on."""
+    """Return the pipe to the parent. From now on, output of libraries to stdout goes to stderr."""
     pipe = os.fdopen(os.dup(1), "w", encoding="utf-8")
     sys.stdout.flush()
     os.dup2(2, 1)

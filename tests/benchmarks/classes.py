@@ -1,4 +1,4 @@
-"""What was wrongly taken for a tree, by class: in simulated stands and in labelled scans."""
+"""False trees by class, in simulated stands and in labelled scans."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.types.records import Bool, Float, Int, Trees, TruthTrees
 from tests.benchmarks.table import Cell, Table
 
 NOTHING = "nothing"
-NEAR = 0.35  # m; labelled points so near to a place say what stands there
+NEAR = 0.35  # m; labelled points within this distance of a position determine its class
 NAMES = {
     10: "car",
     11: "bicycle",
@@ -39,7 +39,7 @@ class ByClass:
         self.taken: Counter[str] = Counter()
 
     def add_map(self, trees: Trees, truth: TruthTrees, path: Float, parameters: Evaluation) -> None:
-        """A simulated run: what the truth says stands at the map's trees, both within reach of the path.
+        """Add a simulated run: the true objects at the mapped trees, both within reach of the path.
 
         Args:
             trees: The map; truth: in its frame; path: shape (N, 2) [m].
@@ -59,7 +59,7 @@ class ByClass:
         self.taken[NOTHING] += int(np.count_nonzero(alone))
 
     def add_labels(self, false: Float, points: Float, label: Int) -> None:
-        """A labelled scan: what most points at each false tree are.
+        """Add a labelled scan: the class of most points at each false tree.
 
         Args:
             false: Places of the map that are no trunk, shape (K, 2) [m].
@@ -76,7 +76,8 @@ class ByClass:
             self.taken[NAMES[int(names[counts.argmax()])] if len(names) else NOTHING] += 1
 
     def table(self, title: str) -> Table:
-        """The counts, the class most often taken first; "of" is empty where nobody counted them."""
+        """Return the counts, the most frequent class first; "of" is empty where the number of objects is
+        unknown."""
         kinds = sorted({*self.there, *self.taken}, key=lambda kind: (-self.taken[kind], kind))
         rows: tuple[tuple[Cell, ...], ...] = tuple(
             (kind, self.taken[kind], self.there.get(kind))

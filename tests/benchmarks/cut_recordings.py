@@ -1,8 +1,8 @@
 """The real scans of a ROS recording, cut to their first points and written again by independent libraries.
 
-Whole scans packed by bzip2 take a quarter of a second to unpack, which is what thousands of copies would
-spend their time with. And of packed parts a checksum or the packing itself finds most damage: in parts that
-are not packed it goes on to whoever reads the messages.
+Whole scans compressed by bzip2 take a quarter of a second to decompress, which would dominate the time of
+thousands of copies. In compressed parts, a checksum or the compression itself detects most damage; in parts
+that are not compressed, damage reaches the reader of the messages.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How well the ground of a scan is found: `python -m tests.benchmarks.ground [park] [street] [sim] [time]`.
+"""Accuracy of the ground of a scan: `python -m tests.benchmarks.ground [park] [street] [sim] [time]`.
 
 park, street: scans with a label a point. Recall: labelled ground within 0.2 m of the terrain; precision: what
 is labelled ground of all labelled points within 0.2 m of it; trunks: the terrain under each labelled trunk
@@ -38,7 +38,7 @@ P = preset("forest")
 
 
 def main() -> None:
-    """Run what was asked for."""
+    """Run the requested measurements."""
     parts: dict[str, Callable[[], None]] = {
         "park": _park, "street": _street, "sim": _sim, "time": _time,
     }  # fmt: skip
@@ -47,7 +47,8 @@ def main() -> None:
 
 
 def heights(points: Float32, places: Float) -> tuple[Float32, Float]:
-    """Height of each point above the terrain of its scan, and the terrain's own height at places (K, 2)."""
+    """Return the height of each point above the terrain of its scan, and the height of the terrain at
+    positions (K, 2)."""
     terrain = find_terrain(points, P.ground)
     level = np.column_stack([places, np.zeros(len(places))]).astype(np.float32)
     return height_above(points, terrain), -height_above(level, terrain).astype(np.float64)

@@ -1,10 +1,10 @@
 """Compares the exit code of runs with the truth: `python -m tests.benchmarks honest`.
 
-Simulated drives are mapped as they are and with the faults of `hostile`, as `stemmap map` does it. A map is
-wrong if it finds fewer of the true trees than that of the good drive by more than WORSE points, or more than
-FALSE of its trees are false, after the map was put onto the truth by a rigid motion (the frame of a map is
-that of its first pose). A wrong map with exit code 0 is a fault of the program; a good drive with exit code 3
-is a false alarm.
+Simulated drives are mapped without a fault and with the faults of `hostile`, as `stemmap map` does. A map is
+wrong if its completeness is more than WORSE points below that of the drive without a fault, or if more than
+the share FALSE of its trees are false. Before, the map is aligned with the truth by a rigid motion, because
+the frame of a map is that of its first pose. A wrong map with exit code 0 is a fault of the program; exit
+code 3 for a drive without a fault is a false alarm.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ class Ended:
     """How a run ended.
 
     Attributes:
-        found, of: True trees that the map has, and those within reach of the path.
+        found, of: Number of true trees in the map, and of those within reach of the path.
         false: Trees of the map without a true tree.
         rmse: Position error of the right trees [m]; None without one.
         turn: Rotation of the map about the first pose [rad].
         code: Exit code.
-        line: The line that says why the map is not to be trusted; "" without one.
+        line: The message with the reason why the map is doubtful; "" without one.
     """
 
     found: int
@@ -144,7 +144,7 @@ def rigid_motion(points: Float, onto: Float) -> tuple[Float, Float]:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is run: scenes, seeds, kinds of odometry, and parts of the names of the faults; () for all."""
+    """Selection of scenes, seeds, kinds of odometry, and parts of the names of the faults; () for all."""
 
     scenes: tuple[str, ...] = SCENES
     seeds: tuple[int, ...] = SEEDS
@@ -181,7 +181,7 @@ def runs(plan: Plan) -> Iterator[tuple[str, int, str, str, Ended, Ended]]:
 
 
 def verdict(name: str, now: Ended, good: Ended) -> str:
-    """Return what a run is worth: "right", "said" (wrong, with exit code 3), "SILENT" (wrong, with exit code
+    """Return the verdict on a run: "right", "said" (wrong, with exit code 3), "SILENT" (wrong, with exit code
     0), "careful" (right, with exit code 3), or "FALSE ALARM" (that of a good drive)."""
     if now.is_wrong(good):
         return "said" if now.code == 3 else "SILENT"

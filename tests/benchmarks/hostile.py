@@ -1,4 +1,4 @@
-"""Hostile recordings: simulated drives whose records or description are wrong, without a word about it."""
+"""Faulty recordings: simulated drives whose records or description are wrong, without any indication."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.types.records import Imu, Odometry, Record, Scan, Truth
 
 S = 1_000_000_000
-BEGIN_S = 15.0  # when a fault begins that is not there from the start
+BEGIN_S = 15.0  # start of a fault that does not begin with the drive
 Change = Callable[[list[Record]], list[Record]]
 
 
@@ -21,8 +21,8 @@ class Variant:
     """A fault of a recording.
 
     Attributes:
-        records: Makes the faulty records of the right ones; they arrive in the order of the list.
-        mounting: What is told of the mounting in place of the truth, T_base_lidar; None for the truth.
+        records: Returns the faulty records from the correct ones; they arrive in the order of the list.
+        mounting: Reported mounting T_base_lidar in place of the true one; None for the true one.
         kinds: What moves the robot: "wheels" (with an IMU), "imu" (LiDAR and IMU), "lidar" (LiDAR alone).
     """
 
@@ -32,7 +32,7 @@ class Variant:
 
 
 class HostileSource:
-    """A source with a fault. Its records are kept in memory."""
+    """A source with a fault. Its records are stored in memory."""
 
     def __init__(self, source: Source, records: Sequence[Record], variant: Variant, *, kind: str) -> None:
         """Make the faulty records.
@@ -41,7 +41,7 @@ class HostileSource:
             source: Source of the right records; stays open.
             records: Its records.
             variant: The fault.
-            kind: What the recording has beside scans, see `Variant`.
+            kind: Data of the recording besides scans, see `Variant`.
         """
         wheels, imu = kind == "wheels", kind != "lidar"
         absent = tuple(each for each, there in ((Odometry, wheels), (Imu, imu)) if not there)
@@ -144,7 +144,7 @@ def _mirrored(records: list[Record]) -> list[Record]:
 
 
 def _frozen(records: list[Record], seconds: float = 10.0) -> list[Record]:
-    """The last reading is repeated for a time, and the odometry counts on from there."""
+    """The last reading is repeated for a time, and the odometry continues from there."""
     begin = _start_ns(records) + round(BEGIN_S * S)
     end, changed = begin + round(seconds * S), list[Record]()
     held: Pose3 | None = None
@@ -168,12 +168,12 @@ def _half_dropped(records: list[Record]) -> list[Record]:
 
 
 def _twice(records: list[Record]) -> list[Record]:
-    """Each scan comes twice with the same stamp."""
+    """Each scan arrives twice with the same stamp."""
     return [r for one in records for r in ([one, one] if isinstance(one, Scan) else [one])]
 
 
 def _twice_restamped(records: list[Record]) -> list[Record]:
-    """Each scan comes again 50 ms later with a stamp of its own."""
+    """Each scan arrives again 50 ms later with a new stamp."""
     changed = list[Record]()
     for r in records:
         changed.append(r)
@@ -226,7 +226,7 @@ _UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
 _AT = np.array([0.1, 0.0, 0.8])  # position of the LiDAR of simulated robots
 ALL = (Scan, Odometry, Imu)
 
-#: The variants by name. "none" is the good run.
+#: The variants by name. "none" is the run without a fault.
 VARIANTS: dict[str, Variant] = {
     "none": Variant(),
     "wheel scale 1.1": Variant(_scaled(1.1), kinds=("wheels",)),

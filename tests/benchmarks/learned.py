@@ -1,4 +1,4 @@
-"""What annotations of simulated streets and parks change: `python -m tests.benchmarks.learned`.
+"""Effect of annotations of simulated streets and parks: `python -m tests.benchmarks.learned`.
 
 Every column of the scenes counts as annotated; scenes are left out as wholes, see
 `app.extensions.learning.learning`.
@@ -21,7 +21,7 @@ APART = 1000.0  # m between two scenes, each of which begins at the origin
 
 
 def main() -> None:
-    """Print trees found and false ones by the decision trees of the package, and by those that learned."""
+    """Print found and false trees of the random forest of the package, and of the refined forest."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--one-way", action="store_true", help="a sensor that looks one way")
     parser.add_argument("--first", type=int, default=400, help="seed of the first scene")

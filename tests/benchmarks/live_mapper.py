@@ -1,7 +1,7 @@
 """Maps one robot as `stemmap map zenoh:...` does: `live_mapper.py PORT NAME [RECORDING]`.
 
-Says when it is ready; at a line on stdin it ends and tells what came, what was mapped and when, and what the
-recording cost.
+The program prints a line when it is ready. At a line on stdin it ends and prints the received and the mapped
+scans with their times, and the CPU time of the recording.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pipeline.mapper import Mapper
 
 
 class Costs:
-    """Adds up what some methods of an object cost the threads that call them."""
+    """Sums the CPU time of some methods of an object in the threads that call them."""
 
     def __init__(self) -> None:
         self.cpu_ns = 0
@@ -53,7 +53,7 @@ def _stop_at_a_line(source: LiveSource) -> None:
 
 
 def main(port: str, robot: str, place: str = "") -> None:
-    """Map until a line comes on stdin and nothing waits any more."""
+    """Map until a line arrives on stdin and no scan waits."""
     warm_up()
     costs = Costs()
     recording = Recorder(Path(place)) if place else None

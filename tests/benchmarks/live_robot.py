@@ -1,7 +1,7 @@
-"""A robot that sends a recording over Zenoh at its own pace: `live_robot.py PORT RUN NAME`.
+"""A robot that sends a recording over Zenoh in real time: `live_robot.py PORT RUN NAME`.
 
-Payloads are sent as they stand in the file, so that it costs little beside what is measured. Begins at a
-line on stdin, and tells then how many scans it sent.
+Payloads are sent as stored in the file, so that the cost is small compared with what is measured. The robot
+starts at a line on stdin, and prints at the end how many scans it sent.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HASH = "RIHS01_0"
 
 
 class Topic:
-    """One topic, announced and numbered as rmw_zenoh does."""
+    """One topic, announced and numbered as by rmw_zenoh."""
 
     def __init__(self, session: Any, robot: str, number: int, topic: str, msgtype: str) -> None:
         name = f"/{robot}{topic}"
@@ -54,7 +54,7 @@ class Topic:
 
 
 def main(port: str, run: str, robot: str) -> None:
-    """Send the whole of a recording once."""
+    """Send a whole recording once."""
     with closing(McapFile(Path(run))) as container:
         channels = {c.number: c for c in container.channels}
         messages = list(container.messages(list(channels), None, {}))

@@ -1,4 +1,4 @@
-"""What figures were measured on, and how much memory this process takes."""
+"""Description of the machine, and memory of processes."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def _cpu() -> str:
 
 
 def peak_mib() -> float:
-    """The most memory that this process ever held [MiB].
+    """Return the peak memory of this process [MiB].
 
-    Linux hands ru_maxrss on through fork and exec, so a child would tell its parent's peak: there the
-    kernel's own high-water mark of this process's memory is read.
+    On Linux, ru_maxrss is inherited through fork and exec, so a child would report the peak of its parent.
+    Therefore the high-water mark that the kernel stores for this process is read.
     """
     marked = _status("VmHWM")
     if marked is not None:
@@ -53,7 +53,8 @@ def peak_mib() -> float:
 
 
 def resident_mib(pid: int | str = "self") -> float:
-    """The memory that a process holds now [MiB]; the peak of this process where the system does not tell."""
+    """Return the resident memory of a process [MiB]; the peak of this process if the system does not provide
+    it."""
     now = _status("VmRSS", pid)
     return peak_mib() if now is None else now
 

@@ -1,4 +1,4 @@
-"""Damaged copies of files, and readers that must bear them."""
+"""Damaged copies of files, and readers that must handle them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ _POLYNOMIAL = 0x82F63B78  # CRC-32C (Castagnoli), reflected
 
 
 def mutation(original: bytes, seed: int, number: int) -> bytes:
-    """A changed copy of a file: bits, zeros, cuts, insertions and numbers; the same for a seed."""
+    """Return a changed copy of a file with changes of bits, zeros, cuts, insertions and numbers, which are
+    the same for equal seeds."""
     rng = np.random.default_rng([seed, number])
     content = bytearray(original)
-    # Headers and indexes stand at the ends, where a change does most.
+    # Headers and indexes are at the ends, where a change has most effect.
     reach = (len(content), 512, 4096)[number % 3]
     for _ in range(int(rng.integers(1, 6))):
         at = int(rng.integers(0, min(reach, len(content)) or 1))
@@ -47,7 +48,8 @@ def mutation(original: bytes, seed: int, number: int) -> bytes:
 
 
 def with_sums(damaged: bytes) -> bytes:
-    """An E57 file with the right sum at the end of each of its pages, and as long as its header says."""
+    """Return an E57 file with the correct checksum at the end of each page, and with the length in its
+    header."""
     pages = np.frombuffer(damaged + bytes(-len(damaged) % PAGE), np.uint8).reshape(-1, PAGE).copy()
     if len(pages):
         pages[0, 16:24] = np.frombuffer(pages.size.to_bytes(8, "little"), np.uint8)

@@ -13,7 +13,7 @@ from pipeline.types.records import Frame, Scan, Sensor, Step
 from tests.benchmarks.recorded import RecordedScan, Recording
 from tests.benchmarks.turns import StageTimes, serve
 
-PERIOD_NS = 100_000_000  # of the scans as both sides map them
+PERIOD_NS = 100_000_000  # of the scans that both sides map
 
 PEERS_NAME = {
     "clustering": "clustering",
@@ -26,7 +26,7 @@ PEERS_NAME = {
 
 
 class Ours:
-    """The mapper, its stages under the names that both sides share."""
+    """The mapper, with the stage names that both sides use."""
 
     def __init__(self, recording: Recording, values: dict[str, Any], seed: int = 0) -> None:
         self._mapper = Mapper(
@@ -64,7 +64,7 @@ class Ours:
 
 
 def step_of(scan: RecordedScan) -> Step:
-    """The record that the mapper takes."""
+    """Return a scan as the record that the mapper processes."""
     return Step(
         index=scan.index,
         scan=Scan(scan.stamp_ns, scan.points, offset_ns=scan.offset_ns),

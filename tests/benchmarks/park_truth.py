@@ -1,7 +1,7 @@
 """True trees of labelled scans as CSV files: `python -m tests.benchmarks.park_truth --out DIR SCENE...`.
 
 A scene is a folder of scans from one place with a label a point; its trees are the middles of the labelled
-trunks of at least 30 returns within 25 m of the sensor, as in `tests.benchmarks.trunks`. Poles are told too.
+trunks of at least 30 returns within 25 m of the sensor, as in `tests.benchmarks.trunks`. Poles are included.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Pictures of path, truth and map for docs/results.md: `python -m tests.benchmarks NAME --pictures DIR`.
 
-Everything is drawn in the frame of the map; truth and odometry are laid on the path by a rigid motion.
+Everything is drawn in the frame of the map; truth and odometry are aligned with the path by a rigid motion.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from pipeline.types.records import Path as DrivenPath
 
 INK, PATH, TRUTH, ODOMETRY, TREE = "#222222", "#1f6fb4", "#d1495b", "#b0b0b0", "#3a7d44"
 WIDTH, DPI, COLOURS = 7.0, 110, 64  # inches; so that a picture stays below 150 kB
-GAP_NS = 5_000_000_000  # a longer silence of the truth is a gap in its line
+GAP_NS = 5_000_000_000  # a longer time without true poses is a gap in the line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drawn:
-    """What a picture shows; positions in metres, paths of shape (N, 3) with their times."""
+    """Content of a picture; positions in metres, paths of shape (N, 3) with their times."""
 
     title: str
     path: DrivenPath
@@ -42,7 +42,7 @@ class Drawn:
 
 
 def mapped(source: Source, seed: int, title: str, truth_name: str, truth: TruthPath | None = None) -> Drawn:
-    """Map a source with the preset that suits it."""
+    """Map a source with its preset."""
     known = source.description
     mapper = Mapper(preset(known.preset), sensor=known.sensor, T_base_lidar=known.T_base_lidar, seed=seed)
     odometry, frame = [], None
@@ -64,7 +64,7 @@ def mapped(source: Source, seed: int, title: str, truth_name: str, truth: TruthP
 
 
 def oxford() -> Drawn:
-    """The benchmark's first seed."""
+    """Oxford Evo with the first seed of the benchmark."""
     from app.extensions.formats.tree_manager import TRAJECTORY, trajectory_text
     from tests.benchmarks.cases.oxford import BIAS, DISTANCE, TURN
     from tests.benchmarks.tree_manager_folder import perturbed, read_recorded, write_states
@@ -82,19 +82,19 @@ def oxford() -> Drawn:
 
 
 def victoria_park() -> Drawn:
-    """From its raw laser."""
+    """Victoria Park from its raw laser scans."""
     with closing(open_source(str(_data() / "victoria_park" / "victoria_park_ascii.zip"))) as source:
         return mapped(source, 1, "Victoria Park: 4 km by car, planar laser, seed 1", "GPS")
 
 
 def sim_long() -> Drawn:
-    """With poor wheels."""
+    """`sim:long` with poor wheel odometry."""
     uri = "sim:long?odometry=poor"
     with closing(open_source(uri, SourceOptions(seed=0))) as source:
         return mapped(source, 0, f"{uri}, seed 0", "true path")
 
 
-#: Of benchmarks, by their name.
+#: Pictures by the names of their benchmarks.
 PICTURES: dict[str, tuple[str, Callable[[], Drawn]]] = {
     "oxford": ("oxford.png", oxford),
     "victoria": ("victoria_park.png", victoria_park),
@@ -164,7 +164,7 @@ def _broken(stamp_ns: Int, xy: Float) -> Float:
 
 
 def _with_few_colours(file: Path) -> None:
-    """A palette halves the file, and lines need no more colours."""
+    """Reduce the picture to a palette, which halves the file."""
     from PIL import Image
 
     with Image.open(file) as picture:
@@ -177,7 +177,7 @@ def _data() -> Path:
 
 
 def draw_all(names: Sequence[str], folder: Path) -> Iterator[Path]:
-    """Draw the pictures of benchmarks, of all where none is named; gives the files as they come.
+    """Draw the pictures of the named benchmarks, or of all, and yield the files as they are written.
 
     Raises:
         StemmapError: There is no such folder, or a benchmark has no picture.

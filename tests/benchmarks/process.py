@@ -30,12 +30,13 @@ _ONE_THREAD = (
 )
 
 
-#: Name of the variable with the root of another clone that is measured in place of this one, or beside it.
+#: Name of the variable with the root of another clone that is measured instead of this one, or in comparison
+#: with it.
 CLONE = "STEMMAP_BENCH_CLONE"
 
 
 def environment(root: Path = ROOT) -> dict[str, str]:
-    """The environment of a child: every library at one thread, and the packages of a clone."""
+    """The environment of a child: one thread per library, and the packages of a clone."""
     path = os.pathsep.join(p for p in (str(root), os.environ.get("PYTHONPATH", "")) if p)
     return {**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "PYTHONPATH": path}
 
@@ -44,7 +45,7 @@ def tables_of(name: str) -> list[Table]:
     """Run a benchmark in a process of its own.
 
     Raises:
-        StemmapError: It failed; its own words are on stderr already.
+        StemmapError: The benchmark failed; its messages are already on stderr.
     """
     words = [sys.executable, "-m", "tests.benchmarks.child", name]
     try:
@@ -69,7 +70,8 @@ def on_cores(function: Callable[[Task], Result], tasks: Iterable[Task]) -> Itera
 
 
 class Side:
-    """One of two processes that are measured in turns: a line of JSON goes in, one comes out.
+    """One of two processes that are measured in turns; each line of JSON on stdin is answered by one on
+    stdout.
 
     Args:
         module: Name of the program of the process; of another clone, the file of this one.
@@ -91,7 +93,7 @@ class Side:
         )
 
     def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
-        """Send a question and wait for the answer.
+        """Send a request and wait for the answer.
 
         Raises:
             StemmapError: The process ended instead.
@@ -109,7 +111,7 @@ class Side:
         return answer
 
     def end(self) -> None:
-        """Close its pipes, and end it if that is not enough."""
+        """Close the pipes of the process, and terminate it if it does not end."""
         for pipe in (self._process.stdin, self._process.stdout):
             if pipe is not None:
                 with contextlib.suppress(BrokenPipeError):
@@ -123,7 +125,7 @@ class Side:
 
 @contextlib.contextmanager
 def sides(modules: Mapping[str, str], *words: str) -> Iterator[dict[str, Side]]:
-    """Start a process for each side and end them all, whatever happens."""
+    """Start a process for each side, and end all of them also after an exception."""
     started: dict[str, Side] = {}
     try:
         for name, module in modules.items():

@@ -1,4 +1,5 @@
-"""How far single scans show trunks: `python -m tests.benchmarks.ranges [--set shape.split_slices=4]`.
+"""Detection of trunks in single scans over distance:
+`python -m tests.benchmarks.ranges [--set shape.split_slices=4]`.
 
 Of the trees of simulated scenes that return at least four points in the height band: for how many the scan
 has a cluster, and a detection, within 0.4 m; and detections that are no tree, by distance.

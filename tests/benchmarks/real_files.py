@@ -11,7 +11,7 @@ import numpy as np
 from tests.benchmarks.cut_recordings import bag_of, plain_mcap_of, short_db3, short_pcap
 from tests.benchmarks.mutating import read_all, read_cloud, with_sums
 
-#: Kinds, the name that a damaged copy gets in a folder of its own, and how it is read.
+#: Kinds, the name of a damaged copy in its folder, and the function that reads it.
 KINDS: dict[str, tuple[str, Callable[[Path], str]]] = {
     "ROS 2 MCAP": ("run.mcap", read_all),
     "MCAP, not packed": ("run.mcap", read_all),
@@ -34,7 +34,7 @@ KINDS: dict[str, tuple[str, Callable[[Path], str]]] = {
     "poses TUM": ("poses.txt", lambda path: read_all(path.parent)),
 }
 
-#: What is done to a damaged copy of a kind, so that its damage is not found by a checksum alone.
+#: Changes of a damaged copy by kind, so that the damage is not already found by a checksum.
 AFTERWARDS: dict[str, Callable[[bytes], bytes]] = {"E57, sums mended": with_sums}
 
 

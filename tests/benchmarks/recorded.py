@@ -1,4 +1,4 @@
-"""Steps of a run written to a folder, so that both sides read the same numbers and neither simulates."""
+"""Steps of a run in a folder, so that both sides read the same data and neither of them simulates."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class RecordedScan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A run: its scans, the sensor and where it stands, all but the points in memory.
+    """A run: its scans, the sensor and its mounting; everything except the points is in memory.
 
     Attributes:
-        folder: Where it lies.
-        steps: One dictionary a scan.
+        folder: Folder of the files.
+        steps: One dictionary per scan.
         rotation, translation: Of T_base_lidar, shapes (3, 3) and (3,) [m].
         sensor: Fields of `pipeline.types.records.Sensor`.
     """

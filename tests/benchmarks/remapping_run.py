@@ -1,5 +1,5 @@
-"""A run that is mapped again after changes of parameters, as a process that is asked for one change at a
-time. It is a program of its own, which also runs with the packages of another clone."""
+"""A process that maps a run again after each requested change of parameters. It is a separate program, which
+also runs with the packages of another clone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WARM_SCANS = 40  # mapped before, so that all kernels are compiled
 
 
 def main() -> None:
-    """Map the first scans of a source, the words of the command line, and answer questions of one line from
+    """Map the first scans of a source, given on the command line, and answer requests of one line from
     stdin: {"change": [name, value]}, with the seconds until the new map and its number of trees."""
     pipe = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

@@ -1,4 +1,4 @@
-"""Maps the runs of docs/results.md anew and puts the figures into its tables.
+"""Maps the runs of docs/results.md again and writes the figures into its tables.
 
 `python -m tests.benchmarks results [paper stands victoria recordings]`: each run is one `stemmap map` in a
 process of its own, and every cell is read from the run.json that it wrote.
@@ -50,7 +50,7 @@ SOURCES = (
 
 
 def paper() -> tuple[str, str]:
-    """The paper's plot with three presets and three seeds."""
+    """Return the table of the plot of the paper with three presets and three seeds."""
     rows = [AS_PRINTED]
     for preset in ("paper", "paper-text", "forest"):
         for seed in range(3):
@@ -62,7 +62,7 @@ def paper() -> tuple[str, str]:
 
 
 def stands() -> tuple[str, str]:
-    """The other scenarios, odometry with noise, three seeds."""
+    """Return the table of the other scenarios, odometry with noise, three seeds."""
     runs = [(f"sim:{name}", seed) for name in ("stand", "slope", "dense") for seed in range(3)]
     rows = []
     for uri, seed in [*runs, ("sim:long?odometry=poor", 0)]:
@@ -139,7 +139,7 @@ def table(columns: Iterable[str], rows: Rows) -> str:
 
 
 def replaced(text: str, heading: str, new: str, line: str) -> str:
-    """The file with another table below a heading, and another line behind that table if one is given."""
+    """Return the file with another table below a heading, and another line after it if one is given."""
     before, found, rest = text.partition(heading + "\n")
     if not found:
         raise ValueError(f"there is no heading {heading!r}")
@@ -171,7 +171,7 @@ def _cm(metres: float | None, digits: int) -> str:
 
 
 def main(names: list[str]) -> None:
-    """Make the sections of these names, or all."""
+    """Write the sections with these names, or all."""
     for name in names or SECTIONS:
         heading, make = SECTIONS[name]
         new, line = make()

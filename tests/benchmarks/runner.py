@@ -1,4 +1,4 @@
-"""Runs benchmarks by name and writes what came of them."""
+"""Runs benchmarks by name and writes their results."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ B), each library at one thread, because machines are noisy: ratios hold, absolut
 
 
 def descriptions() -> dict[str, str]:
-    """Name and one line of every benchmark."""
+    """Return the name and the one-line description of every benchmark."""
     names = sorted(module.name for module in pkgutil.iter_modules(cases.__path__))
     modules = [importlib.import_module(f"tests.benchmarks.cases.{name}") for name in names]
     return {module.NAME: module.LINE for module in modules}
 
 
 def run(names: Sequence[str], *, out: Path, json_file: Path | None, day: date) -> list[str]:
-    """Run benchmarks one after the other and write the files; the names of those that failed.
+    """Run benchmarks one after the other, write the files, and return the names of those that failed.
 
     Args:
         names: None given means all.
         out: Markdown; sections of benchmarks that were not run, or failed, are kept.
         json_file: The figures of this run alone.
-        day: Written beside the figures.
+        day: Date that is written with the figures.
 
     Raises:
         StemmapError: There is no such benchmark or folder.

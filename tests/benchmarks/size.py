@@ -20,7 +20,7 @@ from pathlib import Path
 
 PACKAGES = ("app", "pipeline")
 EXTENSIONS = "app/extensions"
-WEB = "app.web.app"  # what the web process imports
+WEB = "app.web.app"  # packages that the web process imports
 HEAVY = ("numba", "scipy", "sklearn", "open3d")
 KERNEL = re.compile(r"^@compiled\w*$", re.MULTILINE)
 #: Names of the parts of viser's client that are not public.

@@ -1,5 +1,5 @@
-"""Runs for SLAM alone: what was detected in each scan is made once and kept, so that ten seeds cost ten
-runs of SLAM and tracking and not ten of the whole pipeline. The order of calls is the mapper's."""
+"""Runs for SLAM alone: the detections of each scan are computed once and stored, so that ten seeds need ten
+runs of SLAM and tracking and not ten runs of the whole pipeline. The order of calls is that of the mapper."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DUPLICATE = 1.0  # m; two trees of the map nearer than this in a stand of wider 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """One scan as SLAM and tracking take it."""
+    """One scan as the input of SLAM and tracking."""
 
     stamp_ns: int
     odometry: Pose2
@@ -41,8 +41,8 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:
-    """What came of a run: error of the path without and with SLAM [m], trees, and pairs of them that
-    stand nearer than a metre."""
+    """Result of a run: error of the path without and with SLAM [m], trees, and pairs of trees nearer than a
+    metre."""
 
     seed: int
     rms: float
@@ -121,7 +121,7 @@ METHOD_COLUMNS = ("method", *COLUMNS, "s")
 
 
 def by_method(rows: Sequence[Seen], truth: Truth, parameters: Parameters, title: str) -> Table:
-    """The methods beside one another on the same scans, three seeds each."""
+    """A comparison of the methods on the same scans, three seeds each."""
     table: list[tuple[Cell, ...]] = []
     for method in METHODS:
         changed = parameters.replace({"slam.method": method})

@@ -1,4 +1,4 @@
-"""Stands without a scanner, for SLAM alone: where the trees are, and how the robot drives through them."""
+"""Stands without a scanner, for SLAM alone: positions of the trees, and paths of the robot."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ APART = 1.5  # m between two trees
 
 @dataclass(frozen=True, slots=True)
 class Stand:
-    """What is driven.
+    """A stand with the path of the robot.
 
     Attributes:
-        name: For people.
-        trees: Draws where they stand, shape (N, 2) [m], in the frame of the first pose.
+        name: Displayed name.
+        trees: Draws the positions of the trees, shape (N, 2) [m], in the frame of the first pose.
         strides: The true motion to each scan but the first.
-        comes_back: Whether known trees are seen again, so that all end within reach of their true place.
+        comes_back: Whether known trees are seen again, so that all trees are near their true positions at the
+        end.
     """
 
     name: str
@@ -31,7 +32,7 @@ class Stand:
 
 
 def ring(radius: float, trees: int, scans: int) -> Stand:
-    """A circle that is driven twice, to the left, among trees on both of its sides."""
+    """A circle that is driven twice counter-clockwise, with trees on both sides."""
 
     def drawn(random: np.random.Generator) -> Float:
         places: list[Float] = []
@@ -46,7 +47,7 @@ def ring(radius: float, trees: int, scans: int) -> Stand:
 
 
 def lane(length: float, trees: int, stride: float, *, back: bool) -> Stand:
-    """A straight way between trees, to its end or there and back."""
+    """A straight path between trees, one way or there and back."""
 
     def drawn(random: np.random.Generator) -> Float:
         places: list[Float] = []

@@ -1,4 +1,4 @@
-"""What a benchmark gives: tables of figures, for people (Markdown) and for programs (JSON)."""
+"""Results of a benchmark: tables of figures as Markdown and JSON."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Table:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Table:
-        """The inverse of `dataclasses.asdict` after a way through JSON."""
+        """The inverse of `dataclasses.asdict` after a conversion to JSON and back."""
         return cls(
             value["title"],
             tuple(value["columns"]),
@@ -52,7 +52,7 @@ class Table:
 
 
 def ratio(peer: float, ours: float) -> str:
-    """How many times the peer's figure is ours, e.g. "12.3x"."""
+    """Return the figure of the peer as a multiple of ours, e.g. "12.3x"."""
     return "-" if ours <= 0.0 else f"{_text(peer / ours)}x"
 
 
@@ -67,7 +67,7 @@ def _line(row: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> s
 
 
 def _text(cell: Cell) -> str:
-    """Three significant digits are what a shared machine can say."""
+    """Return a value with three significant digits, the precision of a shared machine."""
     if cell is None:
         return ""
     if isinstance(cell, float):

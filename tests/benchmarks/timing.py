@@ -1,4 +1,4 @@
-"""Times taken in turns: on a shared machine two sides must be measured side by side."""
+"""Times measured in turns: on a shared machine, two sides must be measured under the same load."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def in_turns(
     warm: bool = True,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, list[float]]:
-    """Time each side once a round, A B A B, in milliseconds; if `warm`, call each once before."""
+    """Time each side once per round, A B A B, in milliseconds; if `warm`, call each side once before."""
     for work in sides.values() if warm else ():
         work()
     times: dict[str, list[float]] = {name: [] for name in sides}

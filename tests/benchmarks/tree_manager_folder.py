@@ -1,4 +1,4 @@
-"""The stems of Oxford Evo (Evo.npz) as the folder of files that they were published as."""
+"""The stems of Oxford Evo (Evo.npz) in the folder format in which they were published."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KEYS = ("xyz", "axis_z", "dbh", "dbh_approx", "score", "reconstructed", "n_clus
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recorded:
-    """The run: columns of its stems by name, and where the sensor was, one pose a frame."""
+    """The run: columns of its stems by name, and the pose of the sensor at each frame."""
 
     stems: dict[str, np.ndarray]
     stamp_ns: Int
@@ -38,7 +38,7 @@ class Recorded:
 
 
 def read_recorded(file: Path) -> Recorded:
-    """The run as it was kept; times count from its start."""
+    """Read the stored run; times are relative to its start."""
     evo = np.load(file)
     table = evo["trajectory"]
     poses = [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in table]
@@ -47,7 +47,7 @@ def read_recorded(file: Path) -> Recorded:
 
 
 def write_states(recorded: Recorded, folder: Path, every: int = 1) -> None:
-    """Write one TreeManagerState file a frame; only every so many-th has stems, the others are empty."""
+    """Write one TreeManagerState file per frame; only each `every`-th file has stems."""
     stems, frames = recorded.stems, len(recorded.poses)
     order = np.argsort(stems["frame"], kind="stable")
     begin = np.searchsorted(stems["frame"][order], np.arange(frames + 1))
@@ -57,7 +57,7 @@ def write_states(recorded: Recorded, folder: Path, every: int = 1) -> None:
 
 
 def _rows(stems: dict[str, np.ndarray]) -> list[list[float | bool]]:
-    """The axis' other two directions were not kept."""
+    """The other two directions of the axis are not stored."""
     n = len(stems["xyz"])
     axes = np.full((n, 3, 3), np.nan)
     axes[:, :, 2] = stems["axis_z"]
@@ -70,13 +70,13 @@ def _rows(stems: dict[str, np.ndarray]) -> list[list[float | bool]]:
 def perturbed(
     poses: Sequence[Pose3], *, distance: float, turn: float, bias: float, rng: np.random.Generator
 ) -> list[Pose3]:
-    """The poses as a worse odometry would tell them; roll, pitch and height stay.
+    """Return the poses with the errors of a worse odometry; roll, pitch and height are unchanged.
 
     Args:
-        poses: True ones.
-        distance: Standard deviation of a step's length, as a part of it.
-        turn: Of the heading [rad/sqrt(m)]; bias: its drift [rad/m].
-        rng: Draws the noise.
+        poses: True poses.
+        distance: Standard deviation of the length of a step, as a fraction of it.
+        turn, bias: Noise [rad/sqrt(m)] and drift [rad/m] of the heading.
+        rng: Random numbers of the noise.
     """
     at = poses[0].planar()
     told = [poses[0]]

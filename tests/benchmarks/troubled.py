@@ -1,4 +1,4 @@
-"""Drives through ready stems on which something goes wrong, as the records that come of them."""
+"""Drives with detected stems and faults, as records of a source."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.types.records import Float, Odometry, PoseMeasurement, Record, Scan, Sensor, Stems
 
 MS = 1_000_000
-KNOWN, AFTER = 40, 55  # scans before the trouble, and since it began
+KNOWN, AFTER = 40, 55  # scans before the fault, and since it began
 REACH, SIGMA = 9.0, 0.03  # m
 SENSOR = Sensor("stems", rings=0, ring_step=0.0, azimuth_step=0.0, range_sigma=SIGMA)
 GAP_MS = 60_000
 
 
 def parameters(**changes: object) -> Parameters:
-    """For stems whose places err by SIGMA, and wheels as the preset forest takes them to be."""
+    """Parameters for stems with a position error of SIGMA, and the odometry noise of the preset forest."""
     forest = preset("forest").slam
     own = {
         "detection.sigma_range": SIGMA,
@@ -32,21 +32,23 @@ def parameters(**changes: object) -> Parameters:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A stand and the robot's stride through it; trees a square metre, no two nearer than `apart` [m]."""
+    """A stand and the step of the robot per scan; trees per square metre, at least `apart` [m] from each
+    other."""
 
     stride: Pose2
     density: float
     apart: float = 1.5
 
     def path(self, push: Pose2 | None = None) -> list[Pose2]:
-        """True poses; `push` is how the robot comes to the scan of the trouble."""
+        """True poses; `push` is the motion of the robot to the scan of the fault."""
         poses = [Pose2()]
         for k in range(1, KNOWN + AFTER):
             poses.append(poses[-1] @ (push if push is not None and k == KNOWN else self.stride))
         return poses
 
     def trees(self, seed: int) -> Float:
-        """Where they stand, shape (N, 2) [m]: none on the way, but all around it and where a push leads."""
+        """Positions of the trees, shape (N, 2) [m]: none on the path, but all around it and around the end of
+        a push."""
         rng = np.random.default_rng([5, seed])
         way = np.array([[p.x, p.y] for p in self.path()])
         low, high = way.min(axis=0) - 13.0, way.max(axis=0) + 13.0
@@ -70,19 +72,19 @@ PLACES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """What comes of a place and a trouble: all trees, true poses, and the records."""
+    """A drive in a place with a fault: all trees, true poses, and the records."""
 
     trees: Float
     truth: list[Pose2]
     records: list[Record]
 
     def error(self, k: int, told: Pose2) -> float:
-        """Of the position at scan k [m]."""
+        """Return the position error at scan k [m]."""
         return float(np.hypot(told.x - self.truth[k].x, told.y - self.truth[k].y))
 
     def false_trees(self, place: Float, drift: float) -> int:
-        """How many places, shape (T, 2) [m], are of no tree, or of one that has another already; the map may
-        lie off by `drift` [m]."""
+        """Return the number of positions, shape (T, 2) [m], without a tree, or with a tree that has another
+        position already; the offset of the map is at most `drift` [m]."""
         away = np.hypot(*(place[:, None] - self.trees[None]).transpose(2, 0, 1))
         near = away.argmin(axis=1)[away.min(axis=1, initial=np.inf) < 0.3 + drift]
         return len(place) - len(np.unique(near))
@@ -92,7 +94,7 @@ Told = Sequence[Pose2 | None]
 
 
 def drive(place: Place, seed: int, trouble: Trouble) -> Drive:
-    """Drive through a place with a trouble."""
+    """Return a drive through a place with a fault."""
     rng = np.random.default_rng([6, seed])
     trees, truth = place.trees(seed), place.path(trouble.push)
     told = trouble.wheels(_wheels(truth, rng, trouble.push))
@@ -112,14 +114,14 @@ def drive(place: Place, seed: int, trouble: Trouble) -> Drive:
 
 
 def reading(stamp_ms: int, pose: Pose2) -> Odometry:
-    """Of the wheels."""
+    """Return an odometry reading."""
     place = np.array([pose.x, pose.y, 0.0])
     T = Pose3(np.eye(3), place) if np.isnan(pose.x) else Pose3.from_euler(place, 0.0, 0.0, pose.yaw)
     return Odometry(stamp_ms * MS, T)
 
 
 def _wheels(truth: list[Pose2], rng: np.random.Generator, push: Pose2 | None) -> list[Pose2]:
-    """What honest wheels tell; of a push they tell nothing."""
+    """Return the readings of odometry without faults; they do not contain a push."""
     told = [Pose2()]
     for k in range(1, len(truth)):
         step = truth[k - 1].inverse() @ truth[k]
@@ -141,18 +143,19 @@ def _in_order(records: list[Record]) -> list[Record]:
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What goes wrong from scan KNOWN on.
+    """A fault from scan KNOWN on.
 
     Attributes:
-        wheels: Makes of what honest wheels tell what comes, None for no reading.
-        push: How the robot is moved without a word of the wheels, or None.
-        pause_ms: How long nothing comes before the scan of the trouble.
-        arrival: Makes of the records in their order what comes.
-        said: Part of a warning, at the scan of the trouble or soon after; once: else in all scans since then.
-        state: Of the health then; "good" where the map cannot suffer.
-        soon: In so many scans both are said.
-        from_start: It goes wrong from the first scan on.
-        may_be_lost: The robot may say in the end that it is lost.
+        wheels: Returns the readings with the fault from those without faults; None for no reading.
+        push: Motion of the robot that the odometry does not report, or None.
+        pause_ms: Time without records before the scan of the fault [ms].
+        arrival: Returns the records as they arrive from those in order.
+        said: Part of a warning at the scan of the fault or soon after; without `once`, of all scans since
+        then.
+        state: State of the pose quality then; "good" if the fault does not affect the map.
+        soon: Number of scans within which both are reported.
+        from_start: Whether the fault begins at the first scan.
+        may_be_lost: Whether the robot may be lost at the end.
     """
 
     wheels: Callable[[Sequence[Pose2]], Told] = _as_they_are
@@ -168,12 +171,12 @@ class Trouble:
 
 
 def _from(change: Callable[[Pose2], Pose2 | None]) -> Callable[[Sequence[Pose2]], Told]:
-    """The change of all that comes since scan KNOWN."""
+    """Return the change of all readings since scan KNOWN."""
     return lambda told: [p if k < KNOWN else change(p) for k, p in enumerate(told)]
 
 
 def _stuck(first: int, scans: int) -> Callable[[Sequence[Pose2]], Told]:
-    """RunFigures still for so many scans, and counting on then."""
+    """Readings that do not change for a number of scans, and continue from there."""
 
     def stuck(told: Sequence[Pose2]) -> Told:
         last = min(first + scans, len(told)) - 1
@@ -189,30 +192,30 @@ def _restarted(told: Sequence[Pose2]) -> Told:
 
 
 def _again(records: list[Record]) -> list[Record]:
-    """Every fifth scan comes twice."""
+    """Every fifth scan arrives twice."""
     return [r for k, one in enumerate(records) for r in ([one, one] if k % 10 == 1 else [one])]
 
 
 def _late(records: list[Record]) -> list[Record]:
-    """One scan comes half a second late, after five others."""
+    """One scan arrives half a second late, after five others."""
     at = 2 * KNOWN + 1
     return [*records[:at], *records[at + 1 : at + 11], records[at], *records[at + 11 :]]
 
 
 def _swapped(records: list[Record]) -> list[Record]:
-    """Two scans come in the other order."""
+    """Two scans arrive in the wrong order."""
     at = 2 * KNOWN + 1
     return [*records[:at], records[at + 2], records[at + 1], records[at], *records[at + 3 :]]
 
 
 def _back_in_time(records: list[Record]) -> list[Record]:
-    """A reading of the wheels with a stamp of a second ago, that lies 9 m off."""
+    """An odometry reading with a stamp one second earlier and a position error of 9 m."""
     at = 2 * KNOWN + 2
     return [*records[:at], reading(KNOWN * 100 - 1000, Pose2(9.0)), *records[at:]]
 
 
 def _bad_covariance(records: list[Record]) -> list[Record]:
-    """A pose of another source that lies 9 m off, with a covariance that is none."""
+    """A pose of another source with an error of 9 m and an invalid covariance."""
     at = 2 * KNOWN
     pose = PoseMeasurement(KNOWN * 100 * MS, Pose2(9.0, 9.0, 1.0), np.diag([1.0, 1.0, -1.0]))
     return [*records[:at], pose, *records[at:]]

@@ -1,8 +1,8 @@
-"""How well trunks are found: `python -m tests.benchmarks.trunks [park] [street] [dbh] [sim]`.
+"""Accuracy of the detection of trunks: `python -m tests.benchmarks.trunks [park] [street] [dbh] [sim]`.
 
 park, street: the whole mapper on labelled scans. With `--examples DIR` (as STEMMAP_EXAMPLES keeps them) each
 scene is judged by decision trees grown from all other scenes; without, by those of the package, which saw
-these scenes: such figures tell how well they are remembered, not how new places will be found.
+these scenes: such figures are training scores and not those of new places.
 sim: scenes that no training saw (seeds 1 to 5), with exact poses.
 dbh: trunk slices with the diameter by tape.
 """
@@ -50,7 +50,7 @@ EXACT_POSES = {
 
 
 def main() -> None:
-    """Run what was asked for."""
+    """Run the requested measurements."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -135,7 +135,7 @@ def _rates(hit: int, of: int, false: int, poles: int) -> str:
 def _score(place: Float, points: Float, label: Int) -> tuple[Int, Int, Float]:
     """Found, of, false, poles among the false; the first three by distance; and places of the false ones.
 
-    What stands on a labelled trunk of fewer than 30 points, or beyond 25 m, is neither right nor false.
+    Trees on a labelled trunk of fewer than 30 points, or beyond 25 m, are ignored.
     """
     truth = trunks(points, label, 30, REACH)
     small = trunks(points, label, 1, np.inf)
@@ -213,7 +213,8 @@ def tape_errors() -> tuple[list[float], int]:
         with closing(open_source(str(folder / name), SourceOptions(form="scan"))) as source:
             points = next(r.points for r in source.records() if hasattr(r, "points")).astype(np.float64)
         of += 1
-        # Merged from several views, as a whole cloud is: no ray tells which side of the trunk was seen.
+        # Merged from several views, as a whole cloud is, so the visible side of the trunk is not known from a
+        # ray.
         circle = np.zeros(FIGURES)
         xy = points[:, :2] - points[:, :2].mean(axis=0)
         best_circle(xy, TOLERANCE, RADIUS_MIN, RADIUS_MAX, circle)

@@ -1,4 +1,4 @@
-"""What both sides of the comparison with the peer speak: scans are asked for, times are told."""
+"""Protocol of both sides of the comparison with the peer: requests for scans, answers with times."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.benchmarks.machine import peak_mib
 from tests.benchmarks.recorded import RecordedScan, Recording
 
 STAGES = ("acquisition and filters", "clustering", "shape and detection", "SLAM", "tracking")
-WARM_SCANS = 5  # mapped and forgotten, so that imports and compiled loops are loaded
+WARM_SCANS = 5  # mapped but not counted, so that imports and compiled loops are loaded
 
 
 class StageTimes:
@@ -33,7 +33,7 @@ class StageTimes:
 
 
 class Pipeline(Protocol):
-    """A side: maps scan after scan."""
+    """One side of the comparison, which maps scan after scan."""
 
     def process(self, scan: RecordedScan, watch: StageTimes) -> None:
         """Map one scan."""

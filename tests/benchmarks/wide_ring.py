@@ -1,7 +1,7 @@
-"""A wide ring through a stand and over a field without trees, with wheels that err always the same way.
+"""A wide ring through a stand and over a field without trees, with a systematic error of the wheel odometry.
 
-Back among the known trees the path lies off by more than trees stand apart. Ready stems, so that it is the
-mapper's own way from a scan to the map.
+When the robot returns to the known trees, the error of the path exceeds the distance between trees. The scans
+are detected stems, which the mapper processes as usual.
 """
 
 from __future__ import annotations
@@ -17,19 +17,20 @@ from pipeline.mapper import Mapper
 from pipeline.types.records import Float, Frame, Scan, Sensor, Stems, Step
 
 STRIDE, REACH, SIGMA = 0.4, 15.0, 0.04  # m
-HALF = 14.0  # m to both sides of the way
+HALF = 14.0  # m to both sides of the path
 SENSOR = Sensor("stems", rings=0, ring_step=0.0, azimuth_step=0.0, range_sigma=SIGMA)
 NS = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class WideRing:
-    """What is driven.
+    """Parameters of the drive.
 
     Attributes:
-        radius: [m]; density: trees a square metre; laps: how often around.
-        field: Where no tree stands, as parts of the way around.
-        longer, bias: What the wheels tell too much of each metre, and turn too much a metre [rad].
+        radius: Radius [m]; density: trees per square metre; laps: number of laps.
+        field: Section without trees, as fractions of a lap.
+        longer, bias: Errors of the wheel odometry: excess length per metre, and excess rotation per metre
+        [rad].
     """
 
     radius: float = 45.0
@@ -40,7 +41,7 @@ class WideRing:
     bias: float = 0.002
 
     def trees(self, random: np.random.Generator) -> Float:
-        """Where they stand, shape (N, 2) [m], none on the way; the first pose is the origin."""
+        """Positions of the trees, shape (N, 2) [m], none on the path; the first pose is the origin."""
         places: list[Float] = []
         share = 1.0 - (self.field[1] - self.field[0])
         while len(places) < int(share * self.density * 4.0 * np.pi * self.radius * HALF):
@@ -86,20 +87,20 @@ class WideRing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mapped:
-    """What came of it: the mapper, all frames, and the true pose, shape (N, 3), at each scan."""
+    """Result: the mapper, all frames, and the true pose, shape (N, 3), at each scan."""
 
     mapper: Mapper
     frames: list[Frame]
     truth: Float
 
     def errors(self) -> Float:
-        """Of the path as it is at the end, shape (N,) [m]."""
+        """Position errors of the final path, shape (N,) [m]."""
         path = self.mapper.path
         error: Float = np.hypot(path.x - self.truth[:, 0], path.y - self.truth[:, 1])
         return error
 
     def told(self) -> Float:
-        """Of the pose as it was told at each scan, shape (N,) [m]."""
+        """Position errors of the pose reported at each scan, shape (N,) [m]."""
         told = np.array([frame.estimate.T_map_base.as_array() for frame in self.frames])
         error: Float = np.hypot(*(told - self.truth)[:, :2].T)
         return error
@@ -110,7 +111,7 @@ class Mapped:
 
 
 def mapped(ring: WideRing, seed: int, parameters: Parameters | None = None) -> Mapped:
-    """Drive it."""
+    """Map the drive."""
     p = preset("stems") if parameters is None else parameters
     mapper = Mapper(p, sensor=SENSOR, T_base_lidar=Pose3.identity(), seed=seed)
     frames, truth = [], []

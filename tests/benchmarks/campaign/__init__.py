@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 @dataclass(slots=True)
 class Result:
-    """What came of one step.
+    """Result of one step.
 
     Attributes:
         done: Number of files, requests, kills or connections.
-        faults: What should not have happened, a line each.
+        faults: Faults, one line each.
         longest_s: Longest time of one of them [s].
-        peak_mib: Most memory of a process of ours [MiB].
+        peak_mib: Peak memory of a process of stemmap [MiB].
         edits: Edits that the server acknowledged; all are checked.
     """
 

@@ -1,4 +1,4 @@
-"""Browsers that come and go, of which some never read."""
+"""Browsers that connect and disconnect; some of them never read."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ _AT_ONCE = 12
 
 
 def run(turn: int, folder: Path) -> Result:
-    """Open and close connections while a run plays; it must go on, and map as without them."""
+    """Open and close connections while a run plays. The run must continue, and its map must be that without
+    browsers."""
     result, rng = Result(), random.Random(turn)
     with Service(result, SHORT_RUN, folder / f"browsers{turn}") as service, ExitStack() as stack:
         undisturbed = service.map_of(SHORT_RUN)

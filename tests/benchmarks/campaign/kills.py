@@ -1,5 +1,5 @@
-"""kill -9 of the server, and of the process that maps and records, while somebody annotates and a robot is
-recorded."""
+"""kill -9 of the server, and of the process that maps and records, during annotation and the recording of a
+robot."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _kill_once(
     rng: random.Random,
     edits: list[tuple[int, float]],
 ) -> None:
-    """Start a robot and a server, annotate for a while, kill, and see whether the server goes on."""
+    """Start a robot and a server, annotate for a while, kill, and check whether the server continues."""
     with ExitStack() as stack:
         port = free_port()
         started(stack, "-m", "tests.app.robot.router", str(port))
@@ -81,4 +81,4 @@ def _kill_once(
             service.until(lambda: service.worker() is not None, "started the worker again")
             service.until(lambda: service.status().get("state") in ("playing", "waiting"), "went on")
             service.annotate(edits, 0.0)
-            time.sleep(LOSS_S)  # else nothing need be in the recording of the new worker
+            time.sleep(LOSS_S)  # otherwise the recording of the new worker may be empty

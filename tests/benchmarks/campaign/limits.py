@@ -25,7 +25,7 @@ _EDITS = 400
 
 
 def files(turn: int, folder: Path) -> Result:
-    """Read copies of one kind of file that no turn before has read."""
+    """Read copies of one kind of file that no earlier turn has read."""
     kind = list(KINDS)[turn % len(KINDS)]
     first = COPIES * (turn // len(KINDS))
     outcome = fuzz.attack(kind, first + COPIES, first, COPIES_S)
@@ -54,7 +54,7 @@ def disk(turn: int, folder: Path) -> Result:
 
 
 def clocks(turn: int, folder: Path) -> Result:
-    """Set the clock of a robot in the middle of a run; the map must stay what it is."""
+    """Set the clock of a robot in the middle of a run; the map must not change."""
     result, place = Result(1), folder / f"clocks{turn}"
     place.mkdir()
     stand = folder / "short.mcap"

@@ -1,4 +1,4 @@
-"""Faults of the link to a robot: a proxy on TCP in between delays, slows down, stalls and cuts it."""
+"""Faults of the link to a robot: a TCP proxy delays, slows down, stalls and cuts the connection."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.benchmarks.campaign.service import Service, check_recording
 
 FAULTS = ("delay", "stall", "slow", "cut")
 _DELAY_S, _STALL_S, _CUT_S = 0.3, 4.0, 2.0
-_SLOW_BYTES_PER_S = 500_000  # a tenth of what the robot sends
+_SLOW_BYTES_PER_S = 500_000  # a tenth of the data rate of the robot
 _PART = 65_536
 
 
@@ -28,7 +28,7 @@ class Proxy:
 
     Args:
         target: Port on this machine.
-        fault: What is wrong with the link while `is_faulty`.
+        fault: Fault of the link while `is_faulty`.
     """
 
     def __init__(self, target: int, fault: str) -> None:
@@ -97,7 +97,8 @@ class Proxy:
 
 
 def run(turn: int, folder: Path) -> Result:
-    """Map and record a robot behind a link with one fault; the run must go on, and the file be whole."""
+    """Map and record a robot behind a link with one fault. The run must continue, and the file must be
+    complete."""
     result, fault, place = Result(1), FAULTS[turn % len(FAULTS)], folder / f"network{turn}"
     with ExitStack() as stack:
         port = free_port()

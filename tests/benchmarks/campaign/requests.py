@@ -12,14 +12,14 @@ from tests.benchmarks.campaign import Result
 from tests.benchmarks.campaign.service import BROWSER, SHORT_RUN, Service
 
 REQUESTS = 300
-#: These start minutes of computing; the routes that stop and read them are asked.
+#: These start computations of minutes; only the routes that stop and read them are requested.
 _HEAVY = {("post", "/api/learning"), ("post", "/api/search"), ("post", "/api/search/go-on")}
 _WILD = 0.08  # share of values that ignore the schema
 _STRANGE: tuple[Any, ...] = (
     None, True, -1, 0, 2**31, 2**63, -1e308, 1e-300, "", "\0", "../../etc/passwd", "é\U0001f332" * 20,
     "x" * 5000, [], {}, [[[[]]]], {"a": {"b": None}},
 )  # fmt: skip
-#: Values that lead further than random ones, by the name of the field.
+#: Values that pass more checks than random ones, by the name of the field.
 _KNOWN: dict[str, tuple[Any, ...]] = {
     "uri": (
         SHORT_RUN,

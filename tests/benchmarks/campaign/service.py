@@ -1,4 +1,4 @@
-"""`stemmap serve` as a process of a campaign, and what must hold of it whatever happens."""
+"""`stemmap serve` as a process of a campaign, with the checks that must pass after every fault."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from tests.benchmarks.process import ROOT, environment
 
 TOKEN = "token-of-a-campaign-only"
 BROWSER = "0123456789abcdef"
-HANGS_S = 10.0  # an answer may take so long
+HANGS_S = 10.0  # longest allowed time of an answer
 _CLOUD_S = 60.0  # the cloud of a run, for which a child process reads the source again
-_PATIENCE_S = 120.0  # of a busy machine, for a start
+_PATIENCE_S = 120.0  # for a start on a busy machine
 _ORPHAN_S = 20.0  # a live worker finishes its recording within 10 s
 _START = "import sys; from app.cli import main; sys.exit(main())"
 _MARK = "STEMMAP_CAMPAIGN"
@@ -125,7 +125,7 @@ class Service:
         self.until(lambda: "announced and silent" in self.status().get("detail", ""), "found the robot")
 
     def until(self, holds: Callable[[], bool], what: str, limit_s: float = 60.0) -> bool:
-        """Wait until a condition holds; a fault if it does not within the limit."""
+        """Wait until a condition is true; a timeout is a fault."""
         end = time.monotonic() + limit_s
         while not holds():
             if time.monotonic() > end:
@@ -228,7 +228,7 @@ class Service:
 
 
 def check_edits(result: Result, folder: Path, edits: Edits) -> None:
-    """Note the acknowledged edits that the database of a folder does not have."""
+    """Report the acknowledged edits that are missing in the database of a folder."""
     with contextlib.closing(sqlite3.connect(folder / "data" / "annotations.sqlite")) as database:
         known = {(number, round(x, 3)) for number, x in database.execute("SELECT id, x FROM annotations")}
     lost = [edit for edit in edits if (edit[0], round(edit[1], 3)) not in known]
@@ -237,8 +237,8 @@ def check_edits(result: Result, folder: Path, edits: Edits) -> None:
 
 
 def check_recording(result: Result, path: Path, period_s: float = 0.1) -> int:
-    """Mend a recording and return its number of scans; one that cannot be read, or lacks scans in the middle,
-    is a fault."""
+    """Repair a recording and return its number of scans. A recording that cannot be read, or lacks scans in
+    the middle, is a fault."""
     mended = path.with_suffix(".mended.mcap")
     try:
         repair(path, mended)

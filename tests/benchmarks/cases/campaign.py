@@ -21,7 +21,8 @@ NAME = "campaign"
 LINE = "Damaged files, random requests, kill -9, full disks, clocks, links and browsers, in turns"
 
 HOURS = float(os.environ.get("STEMMAP_BENCH_HOURS", "2"))
-#: Finished steps are kept here, so that a campaign that was ended goes on; the folder is removed at its end.
+#: Finished steps are stored here, so that an interrupted campaign continues; the folder is removed at its
+#: end.
 FOLDER = ROOT / ".campaign"
 KINDS: dict[str, Callable[[int, Path], Result]] = {
     "damaged files": limits.files,
@@ -36,14 +37,14 @@ MOST_MIB = 1024.0  # of a reader
 
 
 def run() -> list[Table]:
-    """Run steps of all kinds in turns until the time is over."""
+    """Run steps of all kinds in turns until the time has elapsed."""
     FOLDER.mkdir(exist_ok=True)
     finished = FOLDER / "steps.jsonl"
     steps = [json.loads(line) for line in finished.read_text().splitlines()] if finished.exists() else []
     while sum(step["seconds"] for step in steps) < 3600.0 * HOURS:
         turn, number = divmod(len(steps), len(KINDS))
         kind = list(KINDS)[number]
-        for place in FOLDER.iterdir():  # of the step before, or of one that was ended
+        for place in FOLDER.iterdir():  # of the previous step, or of an interrupted one
             if place.is_dir():
                 shutil.rmtree(place)
         begun = time.monotonic()

@@ -16,7 +16,7 @@ NAME = "consistency"
 LINE = "NEES of pose and trees and NIS over fifty simulated runs, against the 95 % band of chi-square"
 
 RUNS = 50
-SIGMA = 0.05  # m of a detection, as it is told
+SIGMA = 0.05  # m; reported sigma of a detection
 SEEN = 10.0  # m
 WARM = 20  # scans before the first figure
 MATCH = 0.6  # m between a tree of the map and the true one
@@ -24,8 +24,8 @@ MATCH = 0.6  # m between a tree of the map and the true one
 
 @dataclass(slots=True)
 class Errors:
-    """Normalised squared errors: of the pose by run and scan, of each tree at the end, of innovations; and
-    in how many scans the filter took itself for lost."""
+    """Normalised squared errors of the pose by run and scan, of each tree at the end, and of innovations; and
+    the number of scans with the state "lost"."""
 
     pose: list[list[float]] = field(default_factory=list)
     position: list[list[float]] = field(default_factory=list)
@@ -140,7 +140,7 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
     errors.position.append(position)
     errors.innovations.append(float(np.nanmean(nis)))
     if not drive.comes_back:
-        return  # a tree may stand nearer to the place of another than to its own
+        return  # a mapped tree may be nearer to the true position of another tree than to its own
     trees = tracker.trees()
     for place, covariance in zip(
         trees.position[trees.confirmed], trees.covariance[trees.confirmed], strict=True

@@ -1,4 +1,5 @@
-"""Trees with a diameter after the way of *Coverage* and after driving on as far: stands of `sim:wild`."""
+"""Trees with a diameter after the route of *Coverage* and after driving on for the same length: stands of
+`sim:wild`."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ SPACING = 1.5  # m, of the waypoints of a drive
 
 
 def run() -> list[Table]:
-    """Ten stands: the drive of the scenario, then the way, or its course for the same length."""
+    """Ten stands: the drive of the scenario, then the route, or the course of the scenario for the same
+    length."""
     rows, shares = list[tuple[Cell, ...]](), list[tuple[float, float, float]]()
     for seed in chosen_seeds(SEEDS):
         row, share = _stand(seed)
@@ -45,7 +47,7 @@ class _Mapped(NamedTuple):
     Attributes:
         path: The estimated path.
         trees: The confirmed trees, in the frame of the scene.
-        seen: What its scans observed.
+        seen: Area that its scans observed.
     """
 
     path: Path
@@ -101,11 +103,11 @@ def _stand(seed: int) -> tuple[tuple[Cell, ...], tuple[float, float, float]]:
 
 
 def _driven_on(first: SimulatedRun, corners: Float | None, length: float) -> SimulatedRun:
-    """The same run with a longer drive: along a way, or, for None, along the course of the scenario.
+    """The same run with a longer drive: along a route, or, for None, along the course of the scenario.
 
     Args:
         first: The run.
-        corners: Corners of the way, shape (K, 2), the first one where the run ends [m].
+        corners: Corners of the route, shape (K, 2), the first one where the run ends [m].
         length: Length that is driven in addition [m].
     """
     import numpy as np
@@ -149,7 +151,7 @@ def _driven_on(first: SimulatedRun, corners: Float | None, length: float) -> Sim
 
 
 def _map(run: SimulatedRun) -> _Mapped:
-    """Map a run, and record what its scans observed."""
+    """Map a run, and record the area that its scans observed."""
     from pipeline.config import preset
     from pipeline.detection.free_space import clear_range
     from pipeline.geometry.columns import rows_of

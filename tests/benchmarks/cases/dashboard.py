@@ -1,4 +1,4 @@
-"""What looking on costs, and how soon people see: a replay of 30,000 returns a scan at 10 Hz."""
+"""Cost of connected browsers, and their delay: a replay of 30,000 returns per scan at 10 Hz."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NAME = "dashboard"
 LINE = "The dashboard with five browsers: what they cost the mapping, and how soon they see"
 
 BROWSERS = 5
-# Each window plays the same scans, so that what is compared is the same work.
+# Each window plays the same scans, so that equal work is compared.
 FROM_S, WINDOW_S, ROUNDS = 14.0, 8.0, 5
 IDLE_S, CHANGES, LATE, PAGES = 10.0, 30, 5, 3
 SLOWER, LATENCY_MS, IDLE_PERCENT, READY_S, LATE_S = 5.0, 150.0, 5.0, 3.0, 2.0  # asked for
@@ -30,7 +30,7 @@ LONGEST_S = 300.0
 
 
 class Dashboard:
-    """A server with a recording, and the browsers that look on."""
+    """A server with a recording, and the connected browsers."""
 
     def __init__(self, source: Path, folder: Path, stack: ExitStack) -> None:
         self.server = Side("tests.benchmarks.served.server", str(source), str(folder))
@@ -41,14 +41,14 @@ class Dashboard:
         stack.callback(self.browsers.end)
 
     def command(self, kind: str, **fields: float) -> None:
-        """As the buttons of the page do."""
+        """Send a command as the buttons of the page do."""
         self.browsers.ask({"do": "command", "command": {"type": kind, **fields}})
 
     def until(self, what: str, **wanted: Any) -> dict[str, Any]:
         """Wait for a status.
 
         Raises:
-            StemmapError: It never came.
+            StemmapError: The status did not occur in time.
         """
         deadline = time.monotonic() + LONGEST_S
         while True:
@@ -66,7 +66,7 @@ class Dashboard:
         self.until(f"stood at {time_s:g} s", state="paused", going_to="", time_s=time_s)
 
     def play(self, seconds: float) -> dict[str, Any]:
-        """Play for a while from the beginning of the window; the status at its end."""
+        """Play for a while from the beginning of the window; return the status at its end."""
         self.stand(FROM_S)
         self.server.ask({"do": "heard"})
         self.browsers.ask({"do": "heard"})
@@ -78,7 +78,7 @@ class Dashboard:
 
 
 def run() -> list[Table]:
-    """All of it, on one recording."""
+    """Run all measurements on one recording."""
     if not Path("/proc/self/stat").exists():
         raise StemmapError("the processor time of other processes is read from /proc", remedy="Use Linux")
     with ExitStack() as stack:
@@ -86,7 +86,7 @@ def run() -> list[Table]:
         recording = folder / "run.mcap"
         returns = scans.write(recording)
         dashboard = Dashboard(recording, folder / "kept", stack)
-        dashboard.until("played", state="finished")  # once, and all is warm
+        dashboard.until("played", state="finished")  # one pass fills the caches
         return [
             _mapping(dashboard, returns),
             _waiting(dashboard, returns),
@@ -94,7 +94,7 @@ def run() -> list[Table]:
 
 
 def _mapping(dashboard: Dashboard, returns: float) -> Table:
-    """The mapping with no browser and with five, in turns."""
+    """Mapping times without a browser and with five, in turns."""
     times: dict[int, list[float]] = {0: [], BROWSERS: []}
     rates: dict[int, list[float]] = {0: [], BROWSERS: []}
     cpu: dict[int, list[float]] = {0: [], BROWSERS: []}
@@ -135,7 +135,7 @@ def _mapping(dashboard: Dashboard, returns: float) -> Table:
 
 
 def _waiting(dashboard: Dashboard, returns: float) -> Table:
-    """How long people wait for what they see."""
+    """Waiting times of users."""
     rows: list[tuple[Cell, ...]] = []
 
     def row(what: str, values: Sequence[float], unit: str, asked: float | None, part: float = 0.5) -> None:
@@ -190,14 +190,14 @@ def _waiting(dashboard: Dashboard, returns: float) -> Table:
 
 
 def _late_ms(dashboard: Dashboard) -> list[float]:
-    """How late each browser heard of each scan since it was asked last [ms]."""
+    """Delay of each scan at each browser since the last request [ms]."""
     heard = {index: at for index, at, _ in dashboard.server.ask({"do": "heard"})["heard"]}
     told = dashboard.browsers.ask({"do": "heard"})["browsers"]
     return [1e3 * (at - heard[index]) for maps, _ in told for index, at in maps if index in heard]
 
 
 def _slider_ms(dashboard: Dashboard) -> tuple[list[float], list[float]]:
-    """How long the page and the scene wait for a slider's answer [ms]."""
+    """Time until the page and the scene have the answer to a slider [ms]."""
     page, scene = [], []
     for k in range(CHANGES + 1):
         told = dashboard.browsers.ask({"do": "change", "changes": {"clustering.eps": (0.2, 0.5)[k % 2]}})
@@ -208,8 +208,8 @@ def _slider_ms(dashboard: Dashboard) -> tuple[list[float], list[float]]:
 
 
 def _mapped_ms(dashboard: Dashboard) -> list[tuple[list[float], list[float]]]:
-    """How long page and scene wait for a scan that was mapped before [ms]: for steps back, one soon after the
-    other, and for times all over the run."""
+    """Time until page and scene have a scan that was mapped before [ms]: for steps back in quick succession,
+    and for times distributed over the run."""
     last = round(10 * (FROM_S + WINDOW_S))
     dashboard.stand(last / 10)
     at = dashboard.browsers.ask({"do": "status"})["scan_index"]
@@ -219,7 +219,7 @@ def _mapped_ms(dashboard: Dashboard) -> list[tuple[list[float], list[float]]]:
         answers[0].append(dashboard.browsers.ask({"do": "go", "command": step, "index": at - 1 - k}))
         time.sleep(0.1)
     for k in range(CHANGES):
-        # A prime number of scans on: the times are spread evenly over the run.
+        # A prime number of scans, so that the times are spread evenly over the run.
         index = (at + 71 * (k + 1)) % at
         sought = {"type": "seek", "time_s": 0.1 * index + 0.01}
         answers[1].append(dashboard.browsers.ask({"do": "go", "command": sought, "index": index}))
@@ -228,7 +228,7 @@ def _mapped_ms(dashboard: Dashboard) -> list[tuple[list[float], list[float]]]:
 
 
 def _idle(dashboard: Dashboard) -> list[float]:
-    """What web process and worker use while nothing happens [% of a core]."""
+    """CPU use of web process and worker while nothing happens [% of a core]."""
     used = []
     for _ in range(3):
         before = sum(dashboard.server.ask({"do": "cpu"}).values())
@@ -238,7 +238,7 @@ def _idle(dashboard: Dashboard) -> list[float]:
 
 
 def _pages(dashboard: Dashboard, program: Path) -> Iterator[tuple[str, list[float], float | None]]:
-    """Real pages: ready, with points in the scene, and how late one hears of a scan that plays."""
+    """Real pages: time until they are ready and have points, and delay of a scan that plays."""
     ready, drawn = _ready(dashboard, program)
     yield "a page in Chromium, ready", ready, READY_S
     yield "the same, points in the 3D scene", drawn, None
@@ -255,8 +255,8 @@ def _pages(dashboard: Dashboard, program: Path) -> Iterator[tuple[str, list[floa
 
 
 def _ready(dashboard: Dashboard, program: Path) -> tuple[list[float], list[float]]:
-    """Seconds until pages are ready, and until points are in their scenes; the first, of a browser that has
-    just begun, is left out."""
+    """Seconds until pages are ready, and until points are in their scenes; the first page, of a newly started
+    browser, is left out."""
     times = []
     with chromium.chromium(program) as browser:
         for _ in range(PAGES + 1):
@@ -266,7 +266,7 @@ def _ready(dashboard: Dashboard, program: Path) -> tuple[list[float], list[float
 
 
 def _messages_a_scan(dashboard: Dashboard) -> float:
-    """How many messages the scene sends for a scan."""
+    """Number of messages that the scene sends per scan."""
     before = dashboard.server.ask({"do": "messages"})["messages"]
     dashboard.play(WINDOW_S)
     scans_shown = len(dashboard.server.ask({"do": "heard"})["heard"])

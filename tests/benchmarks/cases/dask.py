@@ -1,4 +1,4 @@
-"""Runs mapped by two Dask workers, one of which is killed on the way, beside two local processes."""
+"""Runs mapped by two Dask workers, one of which is killed, compared with two local processes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TURNS = 2
 
 
 def run() -> list[Table]:
-    """A row of each way: time of each turn, and whether the files are those of the first one."""
+    """One row per method: time of each repetition, and whether the files equal those of the first method."""
     with TemporaryDirectory(prefix="stemmap-dask-") as name:
         folder = Path(name)
         runs = folder / "runs"

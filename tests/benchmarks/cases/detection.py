@@ -1,4 +1,4 @@
-"""What it costs to find the trunks in one scan, from the ground to the verdict."""
+"""CPU time of the detection of trunks in one scan, from the ground to the verdict."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 STAGES = ("ground", "voxel grid", "clustering", "shape", "free view", "detection")
 VLP16_MS, RINGS_64_MS = 2.0, 15.0  # asked for
 VLP16_SCANS, EVERY = 500, 5
-WARM, ROUNDS = 1, 20  # times that the scans are gone through
+WARM, ROUNDS = 1, 20  # number of passes over the scans
 
 
 class StageClock:
-    """The mapper's `Watch`: CPU milliseconds of each stage, one entry a scan."""
+    """The `Watch` of the mapper: CPU milliseconds of each stage, one entry per scan."""
 
     def __init__(self) -> None:
         self.ms: dict[str, list[float]] = {stage: [] for stage in STAGES}
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Measure one stage; others than those of detection are let pass."""
+        """Measure one stage; stages that do not belong to detection are ignored."""
         start = time.thread_time()
         yield
         if stage in self.ms:
             self.ms[stage].append(1e3 * (time.thread_time() - start))
 
     def scans(self) -> list[float]:
-        """Milliseconds of each scan, all stages together."""
+        """Total milliseconds of each scan."""
         return [sum(stages) for stages in zip(*self.ms.values(), strict=True)]
 
 
 def run() -> list[Table]:
-    """Scans of the simulated stand and, where the recordings are, of a street with 64 rings."""
+    """Scans of the simulated stand and, if the recordings exist, of a street with 64 rings."""
     cases = [("sim:stand, VLP-16", VLP16_MS, _steps("sim:stand", VLP16_SCANS, EVERY))]
     for folder in ("kitti", "semantickitti"):
         if (DATA / folder).is_dir():
@@ -75,7 +75,7 @@ def run() -> list[Table]:
 
 
 def _steps(uri: str, until: int, every: int) -> tuple[Sensor, list[Step]]:
-    """The sensor, and every so many-th step of a run up to a scan."""
+    """The sensor, and every n-th step of a run up to a scan."""
     from contextlib import closing
 
     from pipeline.io.readers import open_source
@@ -93,7 +93,7 @@ def _steps(uri: str, until: int, every: int) -> tuple[Sensor, list[Step]]:
 
 
 def _measured(sensor: Sensor, run: Sequence[Step]) -> tuple[StageClock, tuple[int, int]]:
-    """Times of the scans, gone through again and again, and their median returns and clusters."""
+    """Times of repeated passes over the scans, and their median numbers of returns and clusters."""
     from pipeline.config import preset
     from pipeline.front_end import detect, segment
     from pipeline.geometry.poses import Pose3

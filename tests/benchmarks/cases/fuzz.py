@@ -1,4 +1,4 @@
-"""Thousands of damaged files of each kind: no crash, no hang, no flood of memory."""
+"""Thousands of damaged files of each kind: no crash, no hang, no excessive memory."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ LINE = "Damaged copies of real files of each kind, read to their end"
 
 COPIES = 5_000
 LONGEST_S, MOST_MIB = 2.0, 512.0
-#: No kind takes more of a core than this, however busy the machine is; the table says how many copies it was.
+#: Maximum CPU time of a kind, independent of the load; the table states the number of copies.
 BUDGET_S = float(os.environ.get("STEMMAP_FUZZ_SECONDS", "600"))
-#: A child that says nothing for so long (by the clock) hangs if it used so much of a core meanwhile, or if it
-#: stays silent for so long whatever it does.
+#: A child without output for _SILENT_S of wall time hangs if it used _HANGS_S of CPU time meanwhile, or if it
+#: has no output for _SLEEPS_S.
 _SILENT_S, _HANGS_S, _SLEEPS_S = 10.0, 20.0, 600.0
 
 
 @dataclass(slots=True)
 class MappingResult:
-    """What came of the copies of one kind."""
+    """Results of the copies of one kind."""
 
     read: int = 0
     refused: int = 0
@@ -80,8 +80,8 @@ def run() -> list[Table]:
 
 
 def attack(kind: str, copies: int, first: int = 0, budget_s: float = BUDGET_S) -> MappingResult:
-    """Read damaged copies from a first number on in a child, and in another from the next on when that one
-    dies or hangs; for at most so many seconds of a core."""
+    """Read damaged copies from a first number on in a child process, for a limited CPU time. When the child
+    dies or hangs, another one continues with the next copy."""
     outcome = MappingResult()
     while first < copies and outcome.used_s < budget_s:
         with tempfile.TemporaryDirectory() as folder:
@@ -100,13 +100,13 @@ def attack(kind: str, copies: int, first: int = 0, budget_s: float = BUDGET_S) -
 
 
 def _processor_s(pid: int) -> float:
-    """Seconds of a core that a process used so far."""
+    """CPU time of a process so far [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _follow(child: subprocess.Popen[str], outcome: MappingResult, first: int, budget_s: float) -> int:
-    """Count what a child tells until it ends; the copy that it would read next."""
+    """Count the reports of a child until it ends; return the copy that it would read next."""
     assert child.stdout is not None
     before, used_s, before_s = first, 0.0, outcome.used_s
     while True:

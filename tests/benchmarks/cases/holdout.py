@@ -1,4 +1,5 @@
-"""Trees in places that the classifier did not learn from, whole clouds, and diameters against a tape.
+"""Trees in places left out of the training of the classifier, whole clouds, and diameters compared with a
+tape.
 
 A place is left out of training as a whole. Park scenes 04 and 07 show the same trees from two positions: a
 rigid motion brings 21 of their stems within 0.25 m of one another, and at most 5 stems of any other pair, as
@@ -27,14 +28,14 @@ NAME = "holdout"
 LINE = "Trees in places left out of training, whole clouds, diameters by tape (needs STEMMAP_DATA)"
 
 PARKS = (("00",), ("02",), ("03",), ("04", "07"), ("06",))
-KEPT_ASIDE = ("01", "08")  # parks for this figure alone, with which nothing is chosen or trained
+KEPT_ASIDE = ("01", "08")  # parks for this figure only, which are not used for training or for any choice
 TRAINING_SEEDS = range(3)
 RESAMPLES = 10_000
 CUT = 4.0  # m; height above the ground at which clouds are cut off
-LOW_CUTS = (3.0, 2.5, 2.0)  # m; phones and tablets see stems up to there
+LOW_CUTS = (3.0, 2.5, 2.0)  # m; phones and tablets see stems up to this height
 THINNED = 0.3  # share of the points
 THINNING_SEEDS = (0, 1)
-SPREAD = 4.0  # cm; the reference DBH of a stem counts where the tools agree to this
+SPREAD = 4.0  # cm; the reference DBH of a stem is used where the programs agree within this
 MATCH = 0.5  # m
 
 
@@ -44,9 +45,9 @@ class MappingResult:
 
     Attributes:
         found: Whether each true tree is in the map, shape (T,).
-        false: The number of trees of the map that are no true tree; what is on a trunk with fewer than 30
-            labelled points counts neither way.
-        kinds: How many false trees stand on each class, by most of the labelled points there.
+        false: Number of trees of the map that are no true tree; trees on a trunk with fewer than 30 labelled
+        points are ignored.
+        kinds: Number of false trees by class, which is that of most labelled points at the tree.
     """
 
     found: Float
@@ -106,7 +107,7 @@ def _table(title: str, rows: Sequence[tuple[Cell, ...]], parks: Sequence[Sequenc
 
 
 def _row(name: str, scenes: Sequence[Sequence[MappingResult]]) -> tuple[Cell, ...]:
-    """One row of the table from the outcomes of scenes, of each with every training seed."""
+    """One row of the table from the results of scenes, each with every training seed."""
     hit, of, false = (
         sum(float(value(o)) for outcomes in scenes for o in outcomes)
         for value in (lambda o: o.found.sum(), lambda o: len(o.found), lambda o: o.false)
@@ -178,8 +179,8 @@ def _fitted_without(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CutCloud:
-    """A whole cloud without the points from a height above the ground on [m], and of the others a share that
-    is drawn at random."""
+    """A whole cloud without the points above a height above the ground [m], reduced to a random share of the
+    others."""
 
     cloud: WholeCloud
     ground: TerrainRaster

@@ -1,4 +1,5 @@
-"""Motion from the LiDAR alone: simulated drives without wheels and IMU, beside the same drives with both.
+"""Motion from the LiDAR alone: simulated drives without wheels and IMU, compared with the same drives with
+both.
 
 Even seeds drive at 2 m/s, odd ones at 0.5 m/s; of four seeds in a row, the last two have a solid-state LiDAR
 with a field of view of 70 degrees. Each drive has two standstills of 10 s, and a turn on the spot by 115
@@ -25,17 +26,17 @@ SCENES = ("stand", "slope", "dense", "wild")
 SEEDS = range(10)
 DURATION_S = 40.0
 FAST, SLOW = 2.0, 0.5  # m/s
-#: A drift is called a share of the driven path; short paths are counted as this long [m].
+#: The drift is a share of the driven path; shorter paths count as this length [m].
 SHORTEST = 10.0
-#: Trees that count as wrong and called good: so many points of completeness or correctness below those with
-#: wheels.
+#: A map counts as wrong without a warning from this many points of completeness or correctness below that
+#: with wheels.
 WORSE = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What came of a drive: driven path [m], largest distance of the path from the true one [m],
-    completeness and correctness [%], and the number of warnings."""
+    """Result of a drive: driven path [m], largest distance of the path from the true one [m], completeness
+    and correctness [%], and the number of warnings."""
 
     way: float
     largest: float

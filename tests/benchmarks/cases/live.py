@@ -1,4 +1,4 @@
-"""Four robots live at once, over a router on this machine."""
+"""Four live robots at once, over a router on this machine."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ ROBOTS, SECONDS, POINTS = 4, 20.0, 30_000
 #: Returns of a VLP-16 of 1,800 columns among trees are 16,500.
 COLUMNS = 3400
 ASKED_P99_MS, ASKED_RECORDING = 100.0, 0.05
-#: A source keeps its first ten scans until it knows what the robot sends, and then catches up.
+#: A source stores its first ten scans until the topics of the robot are known, and then processes them.
 OPENING_SCANS = 20
 
 
 def run() -> list[Table]:
-    """All four, then one that records."""
+    """All four robots, then one with a recording."""
     with tempfile.TemporaryDirectory() as folder:
         drive = Path(folder) / "drive.mcap"
         points = record_drive(drive)
@@ -60,7 +60,8 @@ def record_drive(place: Path) -> int:
 
 
 def fly(drive: Path, count: int, recording: Path | None = None) -> list[dict[str, Any]]:
-    """Let robots send and mappers map; what each mapper tells, with what its robot sent."""
+    """Let robots send and mappers map; return the report of each mapper with the number of scans that its
+    robot sent."""
     from tests.app.robot.conftest import Child, free_port
 
     port = free_port()
@@ -77,10 +78,10 @@ def fly(drive: Path, count: int, recording: Path | None = None) -> list[dict[str
         names = [f"robot{k + 1}" for k in range(count)]
         mappers = [started("-m", "tests.benchmarks.live_mapper", str(port), name, *words) for name in names]
         robots = [started("-m", "tests.benchmarks.live_robot", str(port), str(drive), name) for name in names]
-        time.sleep(2.0)  # topics are counted for a second after the first is there
+        time.sleep(2.0)  # topics are counted for a second after the first one appears
         for robot in robots:
             robot.go()
-            time.sleep(0.1 / count)  # no two sensors turn together
+            time.sleep(0.1 / count)  # the sensors are not synchronised
         sent = [json.loads(robot.hear()) for robot in robots]
         time.sleep(1.0)
         for mapper in mappers:

@@ -38,12 +38,12 @@ RECALL_NOTE = (
     "Frames within 5 m of the path of the map; found: the best pose is within 5 m. Needed: 0.95. TreeLoc++ "
     "reports 0.951 for revisits within V03; here the map is that of another visit."
 )
-#: What the issue asks for: found [%], wrong fixes, position [m], heading [degrees], search [ms].
+#: Requirements of the issue: found [%], wrong fixes, position [m], heading [degrees], search [ms].
 NEEDED = (95.0, 0, 0.3, 1.0, 50.0)
 
 
 def run() -> list[Table]:
-    """A table with simulated stands, and one with the recorded drives if they are there."""
+    """A table with simulated stands, and one with the recorded drives if they exist."""
     starts = int(os.environ.get("STEMMAP_BENCH_STARTS", STARTS))
     root = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
     with tempfile.TemporaryDirectory() as temporary:
@@ -76,8 +76,8 @@ def _maps_of_stand(kind: str, seed: int, folder: Path) -> tuple[Reference, Refer
 
 
 def _simulated(starts: int, folder: Path) -> Table:
-    """Drives through the same stand on other ways, with one tree of ten felled, in its map and in the map of
-    another stand of the same kind."""
+    """Drives through the same stand on other paths, with one of ten trees felled, in its map and in the map
+    of another stand of the same kind."""
     from tests.benchmarks.localise.starts import COLUMNS, row_of
 
     seeds = chosen_seeds(SEEDS)
@@ -194,7 +194,7 @@ def _recorded(root: Path, starts: int, folder: Path) -> list[Table]:
 
 
 def _notes(starts: list[Start]) -> tuple[str, ...]:
-    """Return the figures of all starts beside those that are needed."""
+    """Return the figures of all starts with the required ones."""
     from tests.benchmarks.localise.starts import row_of
 
     total = row_of(starts)
@@ -209,7 +209,7 @@ def _notes(starts: list[Start]) -> tuple[str, ...]:
 
 
 def _kept(name: str, drive: Drive, folder: Path) -> Reference:
-    """Return the map of a drive, which is kept in a folder and read again there."""
+    """Return the map of a drive, which is stored in a folder and read from there the next time."""
     from tests.benchmarks.localise.drives import Reference
 
     file = folder / f"{re.sub(r'[^-A-Za-z0-9_]+', '_', name)}.npz"
@@ -219,7 +219,7 @@ def _kept(name: str, drive: Drive, folder: Path) -> Reference:
 
 
 def _elsewhere(reference: Reference) -> Reference:
-    """Return a map whose place no drive reaches, so that each fix in it is wrong."""
+    """Return a map of a place that no drive reaches, so that each fix in it is wrong."""
     from dataclasses import replace
 
     return replace(reference, truth=reference.truth + 1e6)

@@ -1,4 +1,4 @@
-"""Loops against exact truth: ten simulated minutes with poor wheels."""
+"""Loops compared with the exact truth: ten simulated minutes with poor wheel odometry."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SEEDS = range(1, 4)
 
 
 def run() -> list[Table]:
-    """Three seeds of SLAM over one simulated run, and the methods beside one another."""
+    """Three seeds of SLAM over one simulated run, and a comparison of the methods."""
     import numpy as np
 
     from pipeline.evaluation import evaluate, path_error

@@ -23,7 +23,7 @@ LINE = (
 OPENINGS = int(os.environ.setdefault("STEMMAP_BENCH_OPENINGS", "100"))
 END_MIB, PEAK_MIB = 400.0, 700.0
 LONGEST_S = 240.0  # until the results of a source are there
-PLAYED_S = 12.0  # a long source is played as fast as possible for so long
+PLAYED_S = 12.0  # time for which a long source is played as fast as possible
 SIMULATED = ("stand", "paper", "slope", "dense", "crossing", "wild")
 #: Recordings and clouds among the data for tests.
 RECORDED = (
@@ -34,7 +34,7 @@ RECORDED = (
     "forest/MLS_Clip.laz",
     "oxford_evo/Evo.npz",
 )
-#: Asked for after each opening.
+#: Requested after each opening.
 ASKED = (
     "/api/trees",
     "/api/trees.csv",
@@ -47,7 +47,7 @@ ASKED = (
     "/api/layers/path.geojson",
     "/api/layers/plots.geojson",
 )
-#: Asked for after each fifth opening.
+#: Requested after every fifth opening.
 EXPORTED = ("/api/export/gpkg", "/api/export/geojson", "/api/export/shp", "/api/runs/open/report/html")
 
 
@@ -96,7 +96,7 @@ def run() -> list[Table]:
 
 
 def sources() -> Iterator[str]:
-    """Yield sources without end, simulated and recorded ones in turns; a simulated one is never the same."""
+    """Yield sources without end, simulated and recorded ones in turns; no simulated source is repeated."""
     data = Path(os.environ.get("STEMMAP_DATA", "../shared/data")).resolve()
     recorded = cycle(
         [str(data / name) for name in RECORDED if (data / name).exists()] or ["sim:paper?duration=4"]
@@ -137,6 +137,6 @@ def mapped(browser: Side, uri: str) -> bool:
 
 
 def peak_mib(pid: int) -> float:
-    """Return the most memory that a process held so far [MiB]."""
+    """Return the peak memory of a process so far [MiB]."""
     lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1024.0

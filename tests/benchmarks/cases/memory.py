@@ -17,11 +17,11 @@ NAME = "memory"
 LINE = "Memory over sim:long, ten minutes of driving"
 
 EVERY = 1_000  # scans between two readings
-ALLOWED_MIB = 8.0  # what an allocator may keep; a scan leaked in a thousand would be more
+ALLOWED_MIB = 8.0  # memory that an allocator may keep; a leak of one scan in a thousand would exceed it
 
 
 def run() -> list[Table]:
-    """Map sim:long and read the memory on the way."""
+    """Map sim:long and read the memory during the run."""
     readings = follow("sim:long", EVERY)
     first, last = readings[0], readings[-1]
     growth = (last[1] - last[2]) - (first[1] - first[2])
@@ -46,7 +46,8 @@ def run() -> list[Table]:
 
 
 def follow(uri: str, every: int) -> list[tuple[int, float, float, int]]:
-    """Map a source; scans, resident memory, memory of path and map [MiB], landmarks at each reading."""
+    """Map a source; return scans, resident memory, memory of path and map [MiB], and landmarks at each
+    reading."""
     from pipeline.config import preset
     from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper
@@ -66,14 +67,13 @@ def follow(uri: str, every: int) -> list[tuple[int, float, float, int]]:
 
 
 def _known_mib(mapper: Mapper) -> float:
-    # The gathered voxels are there twice: as they are, and as they were at the last fold.
+    # The collected voxels are stored twice: at present, and at the last fold.
     voxels = in_use_bytes(mapper._columns.memory)
     return (array_bytes(mapper.snapshot()) + array_bytes(mapper.path) + voxels) / 2**20
 
 
 def in_use_bytes(memory: VoxelMap) -> int:
-    """Bytes of the rows of a memory that are in use and of its tables: room that was never filled has no
-    pages."""
+    """Bytes of the used rows of a memory and of its tables; capacity that was never filled has no pages."""
     rows = (memory.key, memory.mean, memory.returns, memory.scans, memory.latest, memory.following)
     used = sum(column[: memory.used].nbytes for column in (*rows, memory.home))
     return used + memory.slot.nbytes + memory.tile_slot.nbytes

@@ -1,4 +1,5 @@
-"""Stems of a forest of 1.5 km (Oxford Evo) read from their folder, with made odometry, over ten seeds."""
+"""Stems of a drive of 1.5 km in a forest (Oxford Evo) read from their folder, with simulated odometry, over
+ten seeds."""
 
 from __future__ import annotations
 
@@ -17,13 +18,14 @@ if TYPE_CHECKING:
 NAME = "oxford"
 LINE = "Oxford Evo, 100 particles, ten seeds: error of the path, all frames and every fifth"
 SEEDS = range(1, 11)
-#: Of the made odometry: part of a step's length, degrees per root of metre, degrees per metre.
+#: Errors of the simulated odometry: fraction of the length of a step, degrees per root of a metre, degrees
+#: per metre.
 DISTANCE, TURN, BIAS = 0.02, 0.5, 0.02
 COLUMNS = ("seed", "odometry RMS [m]", "RMS [m]", "median [m]", "largest [m]", "trees")
 
 
 def run() -> list[Table]:
-    """Tables with all frames, with every fifth, and by method; the odometry differs by seed as well."""
+    """Tables with all frames, with every fifth frame, and by method; each seed has another odometry."""
     from tests.benchmarks.tree_manager_folder import read_recorded
 
     root = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
@@ -32,7 +34,7 @@ def run() -> list[Table]:
 
 
 def _methods(recorded: Recorded) -> Table:
-    """The methods beside one another: three seeds, which differ in the odometry too."""
+    """A comparison of the methods over three seeds, each with another odometry."""
     import tempfile
 
     from tests.benchmarks.slam_runs import METHOD_SEEDS, METHODS
@@ -70,7 +72,7 @@ def _table(recorded: Recorded, every: int) -> Table:
 def mapped_folder(
     recorded: Recorded, folder: Path, seed: int, method: str | None = None
 ) -> tuple[int, float, float, float, float, int]:
-    """The folder with a seed's odometry through source and mapper, as `stemmap map FOLDER` does it."""
+    """Map the folder with the odometry of a seed, as `stemmap map FOLDER` does."""
     from contextlib import closing
 
     import numpy as np

@@ -1,4 +1,4 @@
-"""Ours beside the pipeline that a user would write from the paper with libraries."""
+"""stemmap compared with the pipeline that a user would write from the paper with libraries."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ LINE = "The whole pipeline beside one written with Open3D, NumPy, filterpy and p
 MODULES = {"ours": "tests.benchmarks.ours", "peer": "tests.benchmarks.peer.pipeline"}
 CHUNK = 5  # scans that a side maps before it is the other's turn
 BUDGET_S = 70.0  # of one comparison; the peer is slow, and both stop at the same scan
-# As the paper, but all around the robot, seen from above and with fewer points: about ten trees a scan.
+# As in the paper, but with a box all around the robot, 2D clustering and fewer points: about ten trees per
+# scan.
 _WIDE: dict[str, object] = {
     "filters.x_min": -10.0,
     "clustering.dimensions": 2,
@@ -41,7 +42,8 @@ NOTES = (
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What is mapped by both: a source, every how many scans of it, at most how many, and with what."""
+    """Input of both sides: a source, the step between its scans, the maximum number of scans, and the
+    parameters."""
 
     uri: str
     stride: int
@@ -73,7 +75,7 @@ def compare(comparison: Comparison, budget_s: float) -> list[Table]:
     """Map the same scans with both sides in turns."""
     from pipeline.config import preset
 
-    # The peer looks for no obstacles.
+    # The peer does not search for obstacles.
     parameters = preset(comparison.preset).replace({**comparison.changes, "obstacles.method": "none"})
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

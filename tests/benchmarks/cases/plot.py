@@ -11,7 +11,7 @@ from tests.benchmarks.table import Table
 NAME = "plot"
 LINE = "A real plot with a VLP-16 driven through it (needs STEMMAP_DATA); whole clouds: rivals"
 SEEDS = range(3)
-SPREAD = 4.0  # cm; a diameter is scored where the tools that told it agree so far
+SPREAD = 4.0  # cm; a diameter is scored where the reference programs agree within this
 MATCH = 0.5  # m
 
 
@@ -38,8 +38,8 @@ _NO_SCORES = (None,) * len(SCORES)
 
 
 def stem_scores(place, dbh, table: Path) -> tuple[int | float | None, ...]:
-    """Found stems of the table, error of place and of those diameters that can be scored, and of the place of
-    those stems."""
+    """Found stems of the table, position error, diameter error of the scored stems, and position error of
+    these stems."""
     import csv
 
     import numpy as np

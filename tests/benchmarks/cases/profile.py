@@ -1,4 +1,4 @@
-"""Where the computing time of whole drives goes, by stage, and a step of SLAM beside its limits."""
+"""CPU time of whole drives by stage, and of a step of SLAM compared with its limits."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ STAGES = ("front end", "slam", "tracking", "gathering", "height map", "rest")
 
 @dataclass(slots=True)
 class Profile:
-    """Computing time of a drive: of each stage [s], and milliseconds, detections and landmarks within reach
-    of each scan that SLAM used."""
+    """CPU time of a drive: of each stage [s], and milliseconds, detections and landmarks within reach of each
+    scan that SLAM used."""
 
     scans: int = 0
     total_s: float = 0.0
@@ -62,7 +62,7 @@ class Profile:
             self.stage_s["front end" if stage in FRONT_END else stage] += time.thread_time() - begin
 
     def watched(self, use_scan: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that does what `use_scan` does and notes its time and size."""
+        """Return a function that calls `use_scan` and records its time and size."""
         from pipeline.slam.particle_maps import known_near
 
         def watched(pose: Float, weight: Float, maps: Maps, *rest: Any) -> Any:
@@ -93,7 +93,7 @@ def run() -> list[Table]:
 
 
 def _drives(folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield name and URI of each drive; recordings without odometry get one that drifts."""
+    """Yield name and URI of each drive; recordings without odometry get simulated odometry with drift."""
     import numpy as np
 
     from app.extensions.formats.tree_manager import TRAJECTORY, trajectory_text
@@ -120,7 +120,7 @@ def _drives(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _profile(uri: str, scans: int) -> Profile:
-    """Map a drive and return its computing times; reading is not in them."""
+    """Map a drive and return its CPU times without the reading."""
     from pipeline.config import preset
     from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper

@@ -16,7 +16,7 @@ NAME = "rates"
 LINE = "The same drives recorded at 5, 10 and 20 Hz: trees, position, DBH, path"
 #: A stand, and one of `sim:wild`, whose seeds 0 to 19 are for scoring only.
 DRIVES = ("sim:stand?seed=1&duration=60", "sim:wild?seed=101")
-FASTEST_NS, RATES = 50_000_000, {20: 1, 10: 2, 5: 4}  # period of 20 Hz; every so many-th scan of it
+FASTEST_NS, RATES = 50_000_000, {20: 1, 10: 2, 5: 4}  # period of 20 Hz; every n-th scan of it
 SEEDS = (0, 1)
 
 

@@ -1,4 +1,4 @@
-"""A real drive without odometry: does a tree stand twice in the map when the robot returns?
+"""A real drive without odometry: trees that are mapped twice when the robot returns.
 
 The recording is `moving/vlp16_campus_loop` of the shared data. Its alley is driven twice, 35 s apart. The
 reference of the path is a graph of registrations of its scans: the steps of LiDAR odometry, and loops between
@@ -28,7 +28,7 @@ NEAR, LATER_S = 0.8, 10.0  # m, s
 APART_S = 15.0  # s between two visits of a place
 REACH = 6.0  # m between two scans that are registered as a loop
 EVERY = 8  # scans between two loops
-FITS = 0.6  # least share of the points of a loop that have a partner
+FITS = 0.6  # minimum share of matched points of a loop
 STEP_SIGMA, LOOP_SIGMA = (0.02, 0.002), (0.10, 0.01)  # m, rad
 
 
@@ -54,8 +54,8 @@ def run() -> list[Table]:
 
 
 def _mapped(uri: str, seed: int, *, keep: bool) -> tuple[Float, Float, Sequence[Cloud], Float]:
-    """Map the drive; its path, the confirmed trees (x, y, time first seen), its clouds (if `keep`), and its
-    odometry."""
+    """Map the drive; return its path, the confirmed trees (x, y, time first seen), its clouds (if `keep`),
+    and its odometry."""
     import numpy as np
 
     from app.sources.request import with_odometry
@@ -124,7 +124,8 @@ def _reference(clouds: Sequence[Cloud], odometry: Float) -> Float:
 
 
 def _registered(first: Float, second: Float, at: Float, later: Float) -> Float | None:
-    """The pose x, y, yaw of the second cloud seen from the first one by GICP; None if they do not fit."""
+    """The pose x, y, yaw of the second cloud relative to the first one by GICP; None if the registration
+    fails."""
     import numpy as np
     import small_gicp
 

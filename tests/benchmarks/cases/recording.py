@@ -1,4 +1,4 @@
-"""What a recording loses when its process is killed."""
+"""Losses of a recording whose process is killed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LARGEST_LOSS_S = 1.0
 
 
 def run() -> list[Table]:
-    """Kill it at moments from 1 to 5 s after the first message."""
+    """Kill the process 1 to 5 s after the first message."""
     rows: list[tuple[str, int, int, int, float, float, int]] = []
     with tempfile.TemporaryDirectory() as folder:
         for pace, mapping in PACES.items():
@@ -57,7 +57,7 @@ def run() -> list[Table]:
 
 
 def full_disk(folder: Path) -> dict[str, Any]:
-    """What a live run tells whose recording has no more room."""
+    """Messages of a live run whose recording cannot grow."""
     from pipeline.geometry.poses import Pose3
     from pipeline.io.recording.mcap_writer import write_recording
     from pipeline.types.records import Sensor
@@ -73,8 +73,8 @@ def full_disk(folder: Path) -> dict[str, Any]:
 
 
 def kill_once(folder: Path, k: int, pace: str = "") -> tuple[int, int, float, bool]:
-    """Messages taken, messages that the mended file has, how much time is missing at its end [s], and whether
-    a message is missing before."""
+    """Return the number of received messages and of messages in the repaired file, the missing time at its
+    end [s], and whether an earlier message is missing."""
     from pipeline.io.readers import open_source
     from pipeline.io.readers.mcap_file import McapFile
     from pipeline.io.recording.mcap_writer import repair, write_recording

@@ -46,7 +46,7 @@ def run() -> list[Table]:
 
 
 def _reruns() -> Table:
-    """Each change once; beside another clone, if one is named, in turns."""
+    """Each change once, in turns with another clone if one is named."""
     clone = os.environ.get(CLONE)
     clones = {"before": Path(clone)} if clone else {}
     rows: list[tuple[Cell, ...]] = []
@@ -136,7 +136,7 @@ def _first_run(source: Source, parameters: Parameters, caches: ScanCaches) -> tu
 
 
 def _preview(name: str, value: float, known: KnownMap, source: Source, held: list[Step]) -> tuple[Cell, ...]:
-    """The preview; one before compiles the kernels."""
+    """Measure the preview; an earlier one compiles the kernels."""
     from pipeline.remapping.preview import preview_trees, sample_scans
 
     parameters, words = known.parameters.replace({name: value}), f"{name} → {value}"

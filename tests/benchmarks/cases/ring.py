@@ -1,4 +1,4 @@
-"""A way over a field after which the path lies off by more than trees stand apart, and back to known ones."""
+"""A path over a field whose drift exceeds the distance between trees, and the return to known trees."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 NAME = "ring"
 LINE = "A wide ring over a field, with and without loops being closed: path, trees, duplicates"
 SEEDS = range(20)
-NEAR = 2.0  # m; the path's own error moves trees, so that a nearer match would ask for two things at once
+NEAR = 2.0  # m; the path error also moves trees, so a smaller distance would test two properties at once
 
 
 def run() -> list[Table]:

@@ -33,7 +33,7 @@ class Program:
 
     Attributes:
         name: For the table.
-        packages: What is installed for it; the first one has its version.
+        packages: Packages that are installed for it; the first one has its version.
         words: Returns the command for a Python with these packages, a cloud and a folder for its results.
         stems: Returns positions, shape (N, 2) [m], and diameters, shape (N,) [m], of the results in a folder.
     """
@@ -46,7 +46,7 @@ class Program:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A run of a program: what failed, empty if nothing; wall clock and CPU time [s]; peak of memory [MB]."""
+    """A run of a program: error, empty if there is none; wall time and CPU time [s]; peak memory [MB]."""
 
     failure: str
     wall: float
@@ -85,7 +85,7 @@ COLUMNS = ("plot", "program", "stems", *SCORES[:-1], "wall [s]", "CPU [s]", "pea
 
 
 def _row(program: Program, python: Path | str, cloud: Path, plot: str) -> tuple[Cell, ...]:
-    """Return the cells behind that of the plot; an environment that is a text is the reason why it failed."""
+    """Return the cells after that of the plot. An environment that is a text is the reason of its failure."""
     nothing: tuple[None, ...] = (None,) * (len(COLUMNS) - 3)
     if isinstance(python, str):
         return (program.name, *nothing, python)
@@ -103,8 +103,8 @@ def _row(program: Program, python: Path | str, cloud: Path, plot: str) -> tuple[
 
 
 def _installed(program: Program, root: Path) -> Path | str:
-    """Return the Python of an environment with the packages of a program, made where it is not there; else
-    the reason."""
+    """Return the Python of an environment with the packages of a program, which is created if it is missing;
+    or the reason of a failure."""
     if not program.packages:
         return Path(sys.executable)
     python = root / program.name / "bin" / "python"
@@ -144,7 +144,7 @@ def _measured(words: list[str]) -> Measured:
     return Measured(last if told.returncode else "", wall, cpu, peak / 1e3)
 
 
-#: Linux hands a peak on through fork and exec: a small process starts the one that is measured.
+#: On Linux, a child inherits the peak through fork and exec, so a small process starts the measured one.
 _MEASURE = """
 import os, subprocess, sys, threading, time
 began = time.perf_counter()

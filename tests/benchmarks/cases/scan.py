@@ -1,4 +1,4 @@
-"""What one scan costs the mapper, for sensors of 16 to 128 rings, against what was asked for."""
+"""CPU time of the mapper per scan, for sensors of 16 to 128 rings, compared with the requirement."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ LINE = "The mapper's CPU time for one scan of 16 to 128 rings, stage by stage"
 
 DATA = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
 CHUNK = 20  # scans of a run that are mapped in its turn
-WARM_SCANS = 5  # mapped and forgotten, so that compiled kernels are loaded
+WARM_SCANS = 5  # mapped but not counted, so that compiled kernels are loaded
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A run: its source, the first counted scan, one past the last, and how often it is mapped."""
+    """A run: its source, the first counted scan, one past the last, and the number of times that it is
+    mapped."""
 
     name: str
     uri: str
@@ -53,7 +54,7 @@ CASES = (
 
 @dataclass(slots=True)
 class Measured:
-    """CPU milliseconds of each scan, in total and by stage, and what it held."""
+    """CPU milliseconds of each scan, in total and by stage, and its counts."""
 
     total: list[float] = field(default_factory=list)
     stage: dict[str, list[float]] = field(default_factory=dict)
@@ -72,7 +73,7 @@ class Measured:
             self._now[stage] = self._now.get(stage, 0.0) + 1e3 * (time.thread_time() - begin)
 
     def map(self, mapper: Mapper, step: Step, *, counts: bool) -> None:
-        """Map a scan, and keep its times if it counts."""
+        """Map a scan, and store its times if it is counted."""
         self._now.clear()
         begin = time.thread_time()
         frame = mapper.process(step)

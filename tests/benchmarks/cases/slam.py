@@ -1,4 +1,4 @@
-"""FastSLAM at three sizes, in plain Python at the smallest."""
+"""FastSLAM at three sizes; at the smallest one, also in plain Python."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ SPACING = 3.0  # m between landmarks on their lattice
 SIGMA = 0.05
 AROUND = 25.0  # m
 STRIDE = 0.05  # m a step
-TIMES = 4  # seen so often, all landmarks weigh
+TIMES = 4  # number of views after which all landmarks affect the weights
 
 
 def run() -> list[Table]:
-    """Our FastSLAM at all sizes, the peer's at the smallest."""
+    """Our FastSLAM at all sizes, the peer at the smallest size."""
     rows = [row(*SIZES[0], peer_steps=PEER_STEPS), *(row(*size, peer_steps=0) for size in SIZES[1:])]
     columns = ("particles", "landmarks", "ours ms", "p99", "plain Python ms", "ratio of medians")
     return [
@@ -43,7 +43,7 @@ def run() -> list[Table]:
 
 
 def growth() -> Table:
-    """How a step's time grows with a map of the same density: CPU time of this thread, in turns."""
+    """CPU time of a step by the size of a map of constant density, measured in turns."""
     sides = {str(n): Driven(_ours(100, n), n, known=True) for n in SAME_DENSITY}
     times = in_turns(sides, GROWTH_STEPS, clock=time.thread_time)
     rows = tuple((n, middle(t), sum(t) / len(t)) for n, t in zip(SAME_DENSITY, times.values(), strict=True))
@@ -80,19 +80,21 @@ Feed = Callable[[int, float, "Float"], None]
 
 
 class Driven:
-    """A filter that knows a lattice of landmarks and drives on through it with every call.
+    """A filter with a map of a lattice of landmarks, through which each call drives one step.
 
     Args:
-        feed: Is given the scans.
+        feed: Function that processes a scan.
         landmarks: Of the lattice.
-        known: Whether the filter knows them; else they are shown to it first, ten at a time.
+        known: Whether the map of the filter contains them; otherwise the filter first observes them, ten at a
+        time.
     """
 
     def __init__(self, feed: Feed, landmarks: int, *, known: bool = False) -> None:
         import numpy as np
 
         self._lattice = _lattice(landmarks)
-        # What can be among the nearest on ten metres of way, so that the search for them costs alike.
+        # Landmarks that can be among the nearest within ten metres of path, so that the search for them takes
+        # equal time.
         self._around = self._lattice[np.hypot(self._lattice[:, 0], self._lattice[:, 1]) < AROUND]
         self._feed, self._x, self._index = feed, 0.0, 0
         self._random = np.random.default_rng(0)
@@ -101,7 +103,7 @@ class Driven:
                 self._observe(self._lattice[first : first + OBSERVED], 0.0)
 
     def __call__(self) -> None:
-        """One step on, with the ten nearest landmarks seen; back to the start after ten metres."""
+        """Drive one step and observe the ten nearest landmarks; return to the start after ten metres."""
         import numpy as np
 
         motion = STRIDE if (self._index // 200) % 2 == 0 else -STRIDE
@@ -118,7 +120,7 @@ class Driven:
 
 
 def _lattice(landmarks: int) -> Float:
-    """Where the landmarks stand, shape (L, 2) [m]."""
+    """Return the positions of the landmarks, shape (L, 2) [m]."""
     import numpy as np
 
     columns = max(1, round(landmarks**0.5))
@@ -129,8 +131,8 @@ def _lattice(landmarks: int) -> Float:
 
 
 def _ours(particles: int, landmarks: int) -> Feed:
-    """It is given its map. Shown to it from one place, ten of a lattice look like ten others that lie a step
-    of the lattice off, and the map would have many of them twice."""
+    """Return our filter with its map. If it observed the lattice from one place, it could not distinguish ten
+    landmarks from those one lattice step away, and the map would contain many of them twice."""
     import numpy as np
 
     from pipeline.config import Parameters

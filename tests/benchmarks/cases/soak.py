@@ -44,7 +44,7 @@ class Reading:
 
 
 def run() -> list[Table]:
-    """Play the drive as fast as possible, and read memory and time on the way."""
+    """Play the drive as fast as possible, and read memory and time during it."""
     os.environ[VARIABLE] = str(SCANS)  # for the worker
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())

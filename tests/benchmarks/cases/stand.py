@@ -1,4 +1,4 @@
-"""Stand figures of simulated stands against their exact truth."""
+"""Stand figures of simulated stands compared with their exact ground truth."""
 
 from __future__ import annotations
 

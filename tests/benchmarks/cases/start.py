@@ -1,4 +1,4 @@
-"""How long a person waits: for the help, and for points, a scan and trees on the dashboard."""
+"""Waiting times of a user: for the help, and for points, a scan and trees on the dashboard."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ LONGEST_S = 900.0
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """When something was seen.
+    """Time at which something was observed.
 
     Attributes:
         s: Time since the command [s].
-        cpu_s: Computing time of all processes of the program until then [s].
+        cpu_s: CPU time of all processes of the program until then [s].
     """
 
     s: float
     cpu_s: float
 
 
-#: What a person waits for, in this order, with the words of the table.
+#: Events that a user waits for, in this order, with the words of the table.
 WAITS = {
     "link": "its link",
     "points": "points in the scene",
@@ -61,7 +61,7 @@ WAITS = {
 
 
 def run() -> list[Table]:
-    """Both, each once before for warmth."""
+    """Run both benchmarks; a first run of each, which fills the caches, is not counted."""
     clone = Path(os.environ.get(CLONE, ROOT))
     help_s = [seconds_of_help() for _ in range(HELP_ROUNDS + 1)][1:]
     rows = [_row("stemmap --help", help_s, None, HELP_S)]
@@ -101,25 +101,25 @@ def _row(name: str, seconds: list[float], cpu_s: list[float] | None, asked: floa
 
 
 def command(*words: str) -> list[str]:
-    """The installed command, or the same by way of Python where there is none."""
+    """The installed command, or the equivalent call of Python if it is not installed."""
     script = Path(sys.executable).with_name("stemmap")
     by_python = [sys.executable, "-c", "import sys; from app.cli import main; sys.exit(main())"]
     return [str(script), *words] if script.is_file() else [*by_python, *words]
 
 
 def seconds_of_help() -> float:
-    """From nothing to the end of `stemmap --help`."""
+    """Time of the process `stemmap --help` [s]."""
     start = time.perf_counter()
     subprocess.run(command("--help"), stdout=subprocess.DEVNULL, timeout=LONGEST_S, check=True)
     return time.perf_counter() - start
 
 
 def moments(settings: Mapping[str, str]) -> dict[str, Moment]:
-    """When the things of WAITS were there after `stemmap serve sim:stand`, with more settings of the
-    environment.
+    """Return the times of the events of WAITS after `stemmap serve sim:stand`, with further environment
+    variables.
 
     Raises:
-        StemmapError: They did not come.
+        StemmapError: An event did not occur in time.
     """
     start = time.perf_counter()
     server = subprocess.Popen(
@@ -155,7 +155,7 @@ def moments(settings: Mapping[str, str]) -> dict[str, Moment]:
 
 
 def computing_s(pid: int) -> float:
-    """Return the computing time [s] of a process and of all that it started, by /proc; 0 without it."""
+    """Return the CPU time [s] of a process and of all its children, by /proc; 0 without it."""
     ticks, children = dict[int, int](), dict[int, list[int]]()
     for file in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):  # it has ended
@@ -171,7 +171,7 @@ def computing_s(pid: int) -> float:
 
 
 def _first_link(lines: IO[str], until: float) -> str:
-    """The link that the server prints; a thread reads, so that a silent server cannot hold us."""
+    """The link that the server prints, read by a thread, so that a silent server does not block the caller."""
     read: queue.Queue[str] = queue.Queue()
     threading.Thread(target=_read_into, args=(lines, read), daemon=True).start()
     while time.perf_counter() < until:

@@ -1,4 +1,4 @@
-"""Bad days: what becomes of the map when odometry or scans go wrong, in five places, twenty drives each."""
+"""Faults: the map when odometry or scans are faulty, in five places, twenty drives each."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ NAME = "troubles"
 LINE = "Bad odometry and bad scans, twenty drives each: error, false trees, what is said"
 SEEDS = range(4)
 DRIVE_SEEDS = range(10)
-DRIFT, WRONG = 0.3, 0.5  # m; more than the first the map may not lie off, and at the second it is another one
+DRIFT, WRONG = 0.3, 0.5  # m; maximum offset of the map, and the offset from which a tree is another one
 
 
 @dataclass(frozen=True, slots=True)
 class MappingResult:
-    """Of one drive: error of the pose at its end [m], false trees, whether it was warned of within the scans
-    that it may take, and the state in the end."""
+    """Result of one drive: error of the pose at its end [m], false trees, whether there was a warning within
+    the allowed number of scans, and the state at the end."""
 
     error: float
     false: int
@@ -31,12 +31,12 @@ class MappingResult:
 
     @property
     def is_silent(self) -> bool:
-        """Whether the map is wrong without a word."""
+        """Whether the map is wrong without a warning."""
         return self.state == "good" and (self.error > WRONG or self.false > 1)
 
 
 def run() -> list[Table]:
-    """A row of each trouble."""
+    """One row per fault."""
     import numpy as np
 
     from tests.benchmarks.troubled import PLACES, TROUBLES
@@ -71,7 +71,7 @@ def run() -> list[Table]:
 
 
 def _drives() -> Table:
-    """Faults of the odometry in drives with whole scans."""
+    """Odometry faults in drives with whole scans."""
     from tests.benchmarks.faulty_odometry import FAULTS, MATCH, SECONDS, WRONG, SimulatedDrive
 
     drives = [SimulatedDrive(seed) for seed in chosen_seeds(DRIVE_SEEDS)]
@@ -106,7 +106,7 @@ WORDS = ("good", "weak", "lost")
 
 
 def outcome(place: Place, seed: int, trouble: Trouble) -> MappingResult:
-    """Drive once."""
+    """Map one drive."""
     from pipeline.geometry.poses import Pose3
     from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import steps

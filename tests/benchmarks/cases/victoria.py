@@ -1,4 +1,4 @@
-"""Victoria Park from its raw laser: the error of the path against GPS, over twenty seeds."""
+"""Victoria Park from its raw laser scans: path error with respect to GPS, over twenty seeds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SEEDS = range(1, 21)
 
 
 def run() -> list[Table]:
-    """Twenty seeds after one pass through the stages before SLAM, and the methods beside one another."""
+    """Twenty seeds after one pass through the stages before SLAM, and a comparison of the methods."""
     from tests.benchmarks.slam_runs import COLUMNS, by_method, mapped, seen_in, summary
 
     data = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))

@@ -1,4 +1,4 @@
-"""Stands that are as hard as forests are: `sim:wild`, mapped scan by scan.
+"""Stands as difficult as real forests: `sim:wild`, mapped scan by scan.
 
 The seeds 0 to 19 are for scoring only. Training and development use seeds from 100 on.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 NAME = "wild"
 LINE = "Trees of sim:wild, seeds 0 to 19: completeness, correctness, position, DBH, their 95 % intervals"
 SEEDS = range(20)
-BESIDE = 1.0  # m; a false tree this near to a tree is a second one of it
+BESIDE = 1.0  # m; a false tree this near to a tree is a duplicate of it
 
 
 def run() -> list[Table]:
@@ -58,7 +58,7 @@ def run() -> list[Table]:
 
 @dataclass(frozen=True, slots=True)
 class Inside:
-    """How many positions and diameters are inside of their 95 % intervals, of how many."""
+    """Numbers of positions and diameters inside of their 95 % intervals, and of all."""
 
     positions: int = 0
     of_positions: int = 0
@@ -70,7 +70,7 @@ class Inside:
 
     @property
     def shares(self) -> tuple[float | None, float | None]:
-        """Of the positions and of the diameters [%]."""
+        """Shares of the positions and of the diameters [%]."""
         parts = ((self.positions, self.of_positions), (self.diameters, self.of_diameters))
         return tuple(100.0 * n / of if of else None for n, of in parts)  # type: ignore[return-value]
 
@@ -106,8 +106,8 @@ def _stand(seed: int) -> tuple[tuple[Cell, ...], MapScores, Counter[str], Inside
 
 
 def mapped(uri: str, seed: int) -> tuple[tuple[Cell, ...], MapScores, Counter[str], Inside]:
-    """One stand by its URI: its row, which begins with the seed, its scores, what is nearest to its false
-    trees, and what is inside of its intervals."""
+    """One stand by its URI: its row, which begins with the seed, its scores, the objects nearest to its false
+    trees, and the counts of its intervals."""
     import numpy as np
 
     from pipeline.config import preset
@@ -139,7 +139,7 @@ def mapped(uri: str, seed: int) -> tuple[tuple[Cell, ...], MapScores, Counter[st
 
 
 def _nearest_kinds(trees: Trees, truth: TruthTrees, path: Float, match_distance: float) -> Counter[str]:
-    """What is nearest to the false trees within reach of the path: another object, "beside a tree", or
+    """The nearest object of each false tree within reach of the path: another object, "beside a tree", or
     "nothing"."""
     import numpy as np
 

@@ -18,7 +18,7 @@ SEEDS = range(1, 4)
 
 
 def run() -> list[Table]:
-    """A table with each recording of the folder and each seed; the odometry differs by seed as well."""
+    """A table with each recording of the folder and each seed; each seed has another odometry."""
     root = Path(os.environ.get("STEMMAP_DATA", Path(__file__).parents[4] / "shared" / "data"))
     files = sorted((root / "wild_places").glob("*.npz"))
     rows = list[tuple[Cell, ...]]()

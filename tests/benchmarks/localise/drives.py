@@ -22,7 +22,8 @@ from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Detections, Int, Odometry, Record, Scan, Stems, Trees
 from tests.benchmarks.tree_manager_folder import perturbed, read_recorded
 
-#: Of the made odometry, as in the benchmark `oxford`: part of a step's length, rad/sqrt(m), rad/m.
+#: Errors of the simulated odometry, as in the benchmark `oxford`: fraction of the length of a step,
+#: rad/sqrt(m), rad/m.
 DISTANCE, TURN, BIAS = 0.02, np.radians(0.5), np.radians(0.02)
 SLACK = 0.1  # m; distortion of a map, as in `Localiser`
 NEAR = 25.0  # m; true poses of the stored drive that give the frame of its map at a place
@@ -33,7 +34,7 @@ class Drive:
     """Stems of each frame in the frame of the sensor, and its true poses in a frame that all drives share.
 
     Attributes:
-        name: For tables.
+        name: Name in tables.
         stamp_ns: Time of each frame, int64, shape (F,).
         poses: True poses, one per frame.
         first: Row of the first stem of each frame, and the number of all stems, shape (F + 1,).

@@ -1,4 +1,4 @@
-"""Starts without a pose in stored maps, and what came of them."""
+"""Starts without a pose in stored maps, and their results."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class Start:
     """Result of one start in one map.
 
     Attributes:
-        is_there: Whether the stored drive passed all of the way.
-        found: Distance driven when it was found [m]; NaN if not.
-        wrong: Whether a wrong pose was called found at any time.
+        is_there: Whether the stored drive passed the whole path.
+        found: Distance driven until the robot was found [m]; NaN if it was not.
+        wrong: Whether a wrong pose was reported as found at any time.
         error_xy, error_yaw: Median errors while it was found [m, rad]; NaN if not found or unknown.
         search_s: CPU times of the scans with a search [s].
         state: State at the end.

@@ -28,12 +28,12 @@ STREET = DATA / "semantickitti" / "000000.bin"
 STAND_SEEDS, UPRIGHT_SEEDS, EVERY = range(11, 17), range(31, 37), 4
 STREET_SEEDS, WILD_SEEDS = range(200, 240), range(200, 224)
 REACH = 25.0  # m
-COPIES = 8  # of each park scene with pasted things
+COPIES = 8  # of each park scene with inserted objects
 
 
 def training_examples(names: Sequence[str] = PARKS) -> tuple[list[Examples], list[Examples]]:
-    """Examples of all simulated and labelled scenes, and of the copies with pasted things; kept in the data
-    folder, or in the folder STEMMAP_EXAMPLES. `names` are the park scenes that are used."""
+    """Examples of all simulated and labelled scenes, and of the copies with inserted objects; stored in the
+    data folder, or in the folder STEMMAP_EXAMPLES. `names` are the park scenes that are used."""
     kept = examples_folder()
     p, found = preset("forest"), list[Examples]()
     for uri, furnished, upright in _stands():
@@ -53,7 +53,7 @@ def training_examples(names: Sequence[str] = PARKS) -> tuple[list[Examples], lis
 
 
 def examples_folder() -> Path:
-    """Where the examples of training scenes are kept."""
+    """Folder in which the examples of training scenes are stored."""
     if named := os.environ.get("STEMMAP_EXAMPLES"):
         return Path(named)
     folder = data_folder(os.environ)
@@ -63,8 +63,8 @@ def examples_folder() -> Path:
 
 
 def _stands() -> Iterator[tuple[str, bool, bool]]:
-    """The simulated stands, and whether they have more objects that are not trees, which every second one
-    has, and stems without lean."""
+    """The simulated stands, and for each whether it has more objects that are not trees (every second one)
+    and stems without lean."""
     sigma = ("0.02", "0.03", "0.01")
     for seeds, upright in ((STAND_SEEDS, False), (UPRIGHT_SEEDS, True)):
         for name in ("stand", "slope", "dense"):

@@ -20,7 +20,7 @@ from tests.benchmarks.package_forest import (
 )
 from tests.benchmarks.package_forest.fit import as_json, fit_all
 
-PARKS = ("00", "02", "04", "06")  # two scenes are left for scores
+PARKS = ("00", "02", "04", "06")  # two scenes are held out for scores
 
 
 def main() -> None:

@@ -1,9 +1,9 @@
-"""Augmentation: labelled scans of a sensor that looks one way, with simulated poles and young trees inserted.
+"""Augmentation: labelled scans from one position, with simulated poles and young trees inserted.
 
-Parks have a pole in every second scene, too few to learn from, and whole simulated parks teach other trees
-than real ones. So simulated poles are placed in real scans, where the ground was seen, with the occlusions in
-both directions. As many simulated young trees are placed, so that a forest does not learn to recognise what
-is simulated.
+Only every second park has a pole, which is not enough for the training, and the trees of simulated parks
+differ from real ones. Therefore simulated poles are inserted into real scans, where the ground was seen, with
+the occlusions in both directions. The same number of simulated young trees is inserted, so that a forest does
+not learn to recognise simulated objects.
 """
 
 from __future__ import annotations

@@ -67,7 +67,8 @@ def simulate_street(seed: int, *, one_way: bool) -> StreetScans:
 
     Args:
         seed: Random seed, not negative.
-        one_way: Whether a solid-state LiDAR looks in one direction from one place; else a spinning LiDAR,
+        one_way: Whether a solid-state LiDAR looks in one direction from one place; otherwise a spinning
+        LiDAR,
             which moves in most scenes.
     """
     rng = np.random.default_rng([seed, int(one_way), 0x57AEE7])

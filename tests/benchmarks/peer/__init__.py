@@ -1,3 +1,2 @@
 """The pipeline as a user would write it from the paper with libraries: Open3D, NumPy, filterpy, and a
-FastSLAM in plain Python. It imports nothing of ours; `python -m tests.benchmarks peer` measures it beside
-ours."""
+FastSLAM in plain Python. It imports no module of stemmap; `python -m tests.benchmarks peer` compares both."""

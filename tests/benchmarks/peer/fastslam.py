@@ -1,5 +1,5 @@
-"""FastSLAM 1.0 in plain Python, as Probabilistic Robotics (table 13.1) writes it: every particle asks
-every one of its landmarks how likely each observation is."""
+"""FastSLAM 1.0 in plain Python, as in Probabilistic Robotics (table 13.1): every particle computes the
+likelihood of each observation for each of its landmarks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.benchmarks.peer.stages import Detection, Float, Parameters
 
 @dataclass(slots=True, eq=False)
 class Landmark:
-    """Mean (2,) [m], covariance (2, 2) [m^2] in the frame of the map, and how often it was seen."""
+    """Mean (2,) [m], covariance (2, 2) [m^2] in the frame of the map, and number of observations."""
 
     mean: Float
     covariance: Float
@@ -40,7 +40,7 @@ class Particle:
 
 
 class FastSlam:
-    """Particles that move with the odometry and are weighed by what they recognise."""
+    """Particles that move with the odometry and are weighted by the observations."""
 
     def __init__(self, p: Parameters, seed: int) -> None:
         self.p = p
@@ -48,7 +48,7 @@ class FastSlam:
         self._random = np.random.default_rng(seed)
 
     def process(self, motion: tuple[float, float, float], detections: list[Detection]) -> None:
-        """Move, observe, weigh, resample."""
+        """Predict, update, weight and resample the particles."""
         log_weights = []
         for particle in self.particles:
             self._move(particle, motion)
@@ -131,10 +131,10 @@ class FastSlam:
 
 
 def update(landmark: Landmark, z: Float, R: Float) -> None:
-    """The Kalman update of a resting landmark, H = I."""
+    """The Kalman update of a static landmark, H = I."""
     K = landmark.covariance @ np.linalg.inv(landmark.covariance + R)
     landmark.mean = landmark.mean + K @ (z - landmark.mean)
-    # Views of one trunk share an error of about a centimetre, so it never gets surer than that.
+    # Views of one trunk share an error of about a centimetre, which bounds the covariance from below.
     landmark.covariance = (np.eye(2) - K) @ landmark.covariance
     for a in range(2):
         landmark.covariance[a, a] = max(landmark.covariance[a, a], 1e-4)

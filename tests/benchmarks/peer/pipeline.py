@@ -16,7 +16,7 @@ from tests.benchmarks.turns import StageTimes, serve
 
 
 class Peer:
-    """Maps a recording with libraries; knows no levelling and no ground, as the paper."""
+    """Maps a recording with libraries, without levelling and ground, as in the paper."""
 
     def __init__(self, recording: Recording, p: Parameters, seed: int = 0) -> None:
         self.p = p
@@ -45,7 +45,7 @@ class Peer:
         self._path.append((float(pose[0]), float(pose[1])))
 
     def _motion(self, now: tuple[float, float, float]) -> tuple[float, float, float]:
-        """The odometry's step in the frame of the robot before it."""
+        """Return the odometry step in the frame of the previous pose."""
         before, self._pose = self._pose, now
         if before is None:
             return 0.0, 0.0, 0.0

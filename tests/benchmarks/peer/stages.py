@@ -16,7 +16,7 @@ Parameters = Mapping[str, Any]  # "stage.name" -> value
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detection:
-    """A cluster taken for a tree: place in the base frame (2,) [m], its covariance (2, 2) [m^2]."""
+    """A cluster accepted as a tree: position in the base frame (2,) [m], its covariance (2, 2) [m^2]."""
 
     place: Float
     covariance: Float
@@ -24,7 +24,7 @@ class Detection:
 
 
 def acquire(points: Float, rotation: Float, p: Parameters) -> Float:
-    """Returns within range, turned into the axes of the base."""
+    """Return the points within range, rotated into the axes of the base."""
     distance = np.linalg.norm(points, axis=1)
     kept = (distance >= p["acquisition.range_min"]) & (distance <= p["acquisition.range_max"])
     turned: Float = points[kept] @ rotation.T
@@ -40,7 +40,7 @@ def pass_through(points: Float, p: Parameters) -> Float:
 
 
 def voxel_grid(points: Float, p: Parameters) -> Float:
-    """One mean a voxel (Eq. 2)."""
+    """Return one mean per voxel (Eq. 2)."""
     if len(points) == 0:
         return points
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
@@ -85,7 +85,8 @@ def detect(
 
 
 def _covariance(place: Float, size: int, sigma: float, p: Parameters) -> Float:
-    """Of a centroid: its noise and wandering, and the sensor's error along and across the ray."""
+    """Return the covariance of a centroid: its noise and variation, and the error of the sensor along and
+    across the ray."""
     distance = float(np.linalg.norm(place))
     c, s = place / max(distance, 1e-6)
     along = p["detection.sigma_range"] ** 2

@@ -13,7 +13,7 @@ from tests.benchmarks.peer.stages import Detection, Float, Parameters
 
 @dataclass(slots=True, eq=False)
 class Tree:
-    """A filter with state x, y, vx, vy; how often it was updated, and when last [ns]."""
+    """A filter with the state x, y, vx, vy, its number of updates, and the time of the last one [ns]."""
 
     filter: KalmanFilter
     hits: int
@@ -30,7 +30,7 @@ class TreeMap:
     def process(
         self, stamp_ns: int, pose: Float, pose_covariance: Float, detections: list[Detection]
     ) -> None:
-        """Put each detection to the likeliest tree or begin one (Eq. 9), then merge."""
+        """Associate each detection with the most likely tree or begin a tree (Eq. 9), then merge."""
         c, s = math.cos(pose[2]), math.sin(pose[2])
         turn = np.array([[c, -s], [s, c]])
         taken: set[int] = set()
@@ -95,7 +95,7 @@ class TreeMap:
             i += 1
 
     def confirmed(self) -> list[tuple[float, float]]:
-        """Places of the trees that were seen often enough."""
+        """Return the positions of the trees with enough detections."""
         return [
             (float(tree.filter.x[0]), float(tree.filter.x[1]))
             for tree in self.trees
@@ -104,7 +104,7 @@ class TreeMap:
 
 
 def _join(tree: Tree, other: Tree) -> None:
-    """The older tree takes the other's place for one more measurement."""
+    """Update the older tree with the position of the other one as a measurement."""
     tree.filter.update(other.filter.x[:2], R=other.filter.P[:2, :2])
     tree.hits += other.hits
     tree.stamp_ns = max(tree.stamp_ns, other.stamp_ns)

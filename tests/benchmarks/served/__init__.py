@@ -1,1 +1,1 @@
-"""The dashboard as a process, and who looks at it: for the benchmark `dashboard`."""
+"""The dashboard as a process, and its browsers, for the benchmark `dashboard`."""

@@ -1,6 +1,6 @@
-"""Browsers without a picture: each hears both websockets of the page, as fast as it can.
+"""Browsers without rendering: each reads both websockets of the page as fast as possible.
 
-`python -m tests.benchmarks.served.browsers PORT TOKEN`: a line of JSON goes in, one comes out.
+`python -m tests.benchmarks.served.browsers PORT TOKEN` answers each line of JSON on stdin with one on stdout.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from websockets.typing import Subprotocol
 
 from tests.benchmarks.child import answers
 
-_CLOUD_BYTES = 10_000  # a message of viser with points of a scan has more, those of sliders less
+_CLOUD_BYTES = 10_000  # messages of viser with points of a scan are larger, those of sliders are smaller
 _LONGEST_S = 60.0
 _EXPORT_S = 300.0
 
 
 class Browser:
-    """One page: when it heard of each scan, and when points came to its scene [s]."""
+    """One page: times at which it received each scan, and at which its scene received points [s]."""
 
     def __init__(self, port: int, token: str) -> None:
         self._address, self._headers = f"ws://127.0.0.1:{port}", {"Authorization": f"Bearer {token}"}
@@ -66,7 +66,7 @@ class Browser:
 
 
 class Browsers:
-    """All of them, and a person who does something."""
+    """All browsers, and the actions of a user."""
 
     def __init__(self, port: int, token: str) -> None:
         self._port, self._token = port, token
@@ -80,7 +80,7 @@ class Browsers:
         )
 
     async def answer(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Do what is asked."""
+        """Execute a request."""
         match question:
             case {"do": "browsers", "count": count}:
                 while len(self._open) > count:
@@ -129,14 +129,14 @@ class Browsers:
         sending = asyncio.create_task(self._web.post("/api/command", json=command))
         await _until(lambda: any(each == index for each, _ in browser.maps))
         shown = next(at for each, at in browser.maps if each == index)
-        # The scene is drawn after the map is sent; points before that are of a scan on the way.
+        # The scene is drawn after the map is sent; earlier points belong to an intermediate scan.
         await _until(lambda: any(at >= shown for at in browser.clouds))
         drawn = next(at for at in browser.clouds if at >= shown)
         (await sending).raise_for_status()
         return {"map": 1e3 * (shown - start), "scene": 1e3 * (drawn - start)}
 
     async def _late(self) -> dict[str, Any]:
-        """Seconds until one that comes late has the map and the points of the scan."""
+        """Seconds until a browser that connects later has the map and the points of the scan."""
         start = time.monotonic()
         late = Browser(self._port, self._token)
         await _until(lambda: bool(late.maps and late.clouds))

@@ -1,4 +1,4 @@
-"""A real Chromium with the page open: when it is ready, and how late it hears of a scan."""
+"""A real Chromium with the page open: time until it is ready, and delay of a scan."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DRAWN = """() => { let points = 0;
     if (node.isPoints) points += node.geometry.attributes.position.count;
   });
   return points > 1000; }"""
-# Notes when a map came, by the clock that Python reads too.
+# Records the arrival of a map, with the same clock as Python.
 NOTE_MAPS = """window.__maps = [];
   const Plain = WebSocket;
   window.WebSocket = class extends Plain {
@@ -35,14 +35,14 @@ NOTE_MAPS = """window.__maps = [];
 
 
 def where() -> Path | None:
-    """Chromium's program, None where there is none."""
+    """Return the program of Chromium; None if it is not installed."""
     path = Path(os.environ.get("CHROMIUM", "/usr/bin/chromium"))
     return path if path.exists() else None
 
 
 @contextmanager
 def chromium(program: Path) -> Iterator[Browser]:
-    """A browser, ended in the end."""
+    """A browser, which is closed at the end."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=str(program), headless=True, args=FLAGS)
         yield browser
@@ -51,8 +51,8 @@ def chromium(program: Path) -> Iterator[Browser]:
 
 @contextmanager
 def page_of(browser: Browser, link: str) -> Iterator[tuple[Page, float, float]]:
-    """A page of its own at a link, and the seconds until it is ready: until the trees are listed and the map
-    is there, and until points are in the 3D scene."""
+    """A new page at a link, and the seconds until it is ready: until the trees are listed and the map is
+    drawn, and until points are in the 3D scene."""
     context = browser.new_context(viewport={"width": 1000, "height": 640})
     context.set_default_timeout(LONGEST_MS)
     context.add_init_script(NOTE_MAPS)

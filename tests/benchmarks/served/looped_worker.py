@@ -29,7 +29,7 @@ class LoopedSource(FileSource):
     """One lap of a simulated drive, repeated.
 
     Args:
-        uri: As it was asked for.
+        uri: URI as requested.
         scans: Number of scans.
     """
 
@@ -77,7 +77,7 @@ class LoopedSource(FileSource):
                 shift_ns += BREAK_SCANS * self._period_ns
 
     def _standing(self, pose: Pose3, shift_ns: int) -> Iterator[Record]:
-        """Yield what a robot that stands sends: the same scan, the same pose, no rotation."""
+        """Yield the records of a robot that does not move: the same scan, the same pose, no rotation."""
         imu = next(record for record in self._records if isinstance(record, Imu))
         scan = next(record for record in self._records if isinstance(record, Scan))
         for k in range(BREAK_SCANS):

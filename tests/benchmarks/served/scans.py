@@ -12,7 +12,7 @@ DURATION_S = 26
 
 
 def write(path: Path) -> float:
-    """Write the recording; the mean number of returns of its scans."""
+    """Write the recording; return the mean number of returns per scan."""
     from pipeline.io.readers.simulated import SimulatedSource
     from pipeline.io.recording.mcap_writer import write_recording
     from pipeline.simulation.lidar import SpinningLidar

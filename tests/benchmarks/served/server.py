@@ -1,7 +1,7 @@
-"""The dashboard's server as `stemmap serve` runs it, which tells when it heard of each scan.
+"""The server of the dashboard as in `stemmap serve`, which reports when it received each scan.
 
-`python -m tests.benchmarks.served.server SOURCE FOLDER [WORKER]`: a line of JSON goes in, one comes out.
-WORKER is the module of the mapping process.
+`python -m tests.benchmarks.served.server SOURCE FOLDER [WORKER]` answers each line of JSON on stdin with one
+on stdout. WORKER is the module of the mapping process.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from app.worker.protocol import FromWorker, Open, Shown
 from app.worker.supervisor import OnMessage, WorkerProcess
 from tests.benchmarks.child import answers
 
-# Of the messages that are still missing so many are sent before others get a turn.
+# Number of the missing messages that are sent before other tasks run.
 _AT_ONCE = 1_000
-_LEFT = 1_000  # messages to the renewal of the scene: the latest moment before it
+_LEFT = 1_000  # remaining messages before the renewal of the scene
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
 class Served:
-    """A server in this process, and what is asked of it."""
+    """A server in this process, and the requests to it."""
 
     def __init__(self, source: str, folder: Path, worker: str = "app.worker.process") -> None:
         self._worker_command = python_module(worker)
@@ -56,7 +56,7 @@ class Served:
         self._server = uvicorn.Server(uvicorn_config(app))
 
     async def run(self) -> None:
-        """Serve until the questions end."""
+        """Serve until the requests end."""
         return_freed_memory()
         serving = asyncio.create_task(self._server.serve(sockets=[self._listening]))
         with answers() as pipe:
@@ -107,7 +107,7 @@ class Served:
         return self._dashboard.scene
 
     async def _age(self) -> int:
-        """Send so many messages to the scene that it is about to renew itself; how many it has had."""
+        """Send messages to the scene until just before its renewal; return their number."""
         from viser import _messages
 
         scene = self._scene
@@ -123,7 +123,7 @@ class Served:
 
 
 def _cpu_s(pid: int | None) -> float:
-    """What a process has used of a core so far [s]."""
+    """Return the CPU time of a process so far [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
