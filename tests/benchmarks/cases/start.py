@@ -171,7 +171,7 @@ def computing_s(pid: int) -> float:
 
 
 def _first_link(lines: IO[str], until: float) -> str:
-    """The link that the server prints, read by a thread, so that a silent server does not block the caller."""
+    """The link that the server prints, read by a thread, so that a silent server does not block us."""
     read: queue.Queue[str] = queue.Queue()
     threading.Thread(target=_read_into, args=(lines, read), daemon=True).start()
     while time.perf_counter() < until:
