@@ -53,10 +53,10 @@ def add_observations(
     and radii, and observed sides. NaN in eccentricity or radius adds nothing to its sum.
 
     A radius is converted to breast height, by TAPER from above and by BUTT from below. It is weighted by its
-    inverse variance and by the inverse square of its distance: the errors that a fit does not know, such as
-    the width of a beam, grow with the distance and are the same in every scan, so a hundred distant views
-    must not outweigh a few near ones. The weight also decreases with the distance from breast height, since
-    the taper of the stem is unknown.
+    inverse variance and by the inverse square of its distance: the errors that the sigma of a fit does not
+    include, such as the width of a beam, grow with the distance and are the same in every scan, so a hundred
+    distant views must not outweigh a few near ones. The weight also decreases with the distance from breast
+    height, since the taper of the stem is unknown.
 
     Args:
         tracks: The tracks.
