@@ -279,7 +279,7 @@ class FastSlam:
 
         Associations with old landmarks in the present revisit (`KeyframeGraph.revisit`) were made at the
         drifted pose. They are left out while the graph is solved with the loop, landmarks that the loop
-        brings to the same position are joined, and these detections are then associated anew
+        brings to the same position are joined, and these detections are then associated again
         (`KeyframeGraph.with_known`). The loop is taken if its solution has the larger support
         (`KeyframeGraph.support`).
 

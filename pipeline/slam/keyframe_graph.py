@@ -296,7 +296,7 @@ class KeyframeGraph:
 
     def support(self, revisit: Revisit, solution: Solution) -> float:
         """Return the sum of the kernel weights (`cauchy_weight`) of all detections on the way of a revisit,
-        each with the nearest known landmark of a solution, whatever the data association took it for."""
+        each with the nearest known landmark of a solution, independently of its data association."""
         total = 0.0
         for keyframe, pose in zip(self.keyframes, solution.pose, strict=True):
             _, position = _nearest_known(revisit, keyframe, pose, solution)
