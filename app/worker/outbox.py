@@ -28,7 +28,7 @@ class Outbox:
     A newer frame replaces a waiting frame. A newer status replaces a waiting status if that is the last
     message of the queue and source and state are the same. Other messages are sent in order; beyond
     MOST_MESSAGES the oldest is dropped. After `Opened`, no frame of an older run is sent. The status of a
-    paused or finished run is sent after its frame, so that the web process never knows the time of a scan
+    paused or finished run is sent after its frame, so that the web process never receives the time of a scan
     that it cannot show. A message that cannot be sent is dropped, and the status has a warning.
 
     Args:

@@ -137,7 +137,7 @@ class BeginRecording(msgspec.Struct, frozen=True, tag="record"):
 
 
 class EndRecording(msgspec.Struct, frozen=True, tag="end_recording"):
-    """Finish the recording of a live run, which goes on."""
+    """Finish the recording of a live run; the run continues."""
 
 
 class EndRun(msgspec.Struct, frozen=True, tag="end_run"):
