@@ -80,11 +80,13 @@ def report(question: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         question: The key "path" has the folder of the run, "file" the .html or .pdf file, "language" the
-            language of the report, and "plots" and "parameters" as in `export`.
+            language of the report, "heading" the fields of `Heading`, and "plots" and "parameters" as in
+            `export`.
 
     Raises:
         StemmapError, OSError: See `app.extensions.stand.report`.
     """
+    from app.extensions.stand.heading import Heading
     from app.extensions.stand.parameters import Stand
     from app.extensions.stand.report import report_page, write_report
 
@@ -93,6 +95,7 @@ def report(question: dict[str, Any]) -> dict[str, Any]:
         language=question["language"],
         plots=_plots_of(question),
         parameters=Stand.model_validate(question["parameters"]),
+        heading=Heading(**question["heading"]),
     )
     write_report(page, Path(question["file"]))
     return {}
