@@ -61,6 +61,9 @@ PLOT_FIELDS = (
     Field("area_m2", "area_m2", "m2", "area of the plot"),
     Field("seen_m2", "seen_m2", "m2", "observed part of the area"),
     Field("trees", "trees", "", "number of trees of at least the minimum diameter in the observed part"),
+    Field("trees_with_dbh", "trees_dbh", "", "number of these trees with a diameter"),
+    Field("trees_with_height", "trees_h", "", "number of these trees with a height"),
+    Field("trees_with_volume", "trees_v", "", "number of these trees with a volume; empty without a formula"),
     *_figure_fields(),
 )
 #: Fields of each layer.
@@ -98,7 +101,14 @@ def read_with_plots(folder: FilePath, of_plots: StandResult | None) -> PlottedRu
     if of_plots is not None:
         for plot in of_plots.plots:
             f = of_plots.figures[plot.name]
-            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": f.trees}
+            figures = {
+                "area_m2": f.area,
+                "seen_m2": f.seen,
+                "trees": f.trees,
+                "trees_with_dbh": f.trees - f.without_dbh,
+                "trees_with_height": f.with_height,
+                "trees_with_volume": math.nan if f.with_volume is None else f.with_volume,
+            }
             for name, estimate in f.values.items():
                 figures.update({name: estimate.value, f"{name}_se": estimate.se})
             shapes.append((plot.name, shapely.transform(plot.shape, run.frame.to_crs), figures))

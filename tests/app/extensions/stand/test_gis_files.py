@@ -109,6 +109,30 @@ def test_layers_have_their_fields_places_and_reference_system(runs, tmp_path, ca
             np.testing.assert_allclose(heights, low + np.array([0.5, 1.0, 1.5]), atol=1e-9)
 
 
+@pytest.mark.parametrize("suffix", ["gpkg", "shp"])
+def test_plots_have_the_numbers_of_trees_with_each_value(tmp_path, capsys, suffix):
+    run = grid_run(tmp_path / "run")
+    trees = run / "trees.csv"
+    header, *rows = (line.split(",") for line in trees.read_text().splitlines())
+    rows[0][header.index("dbh_cm")] = rows[0][header.index("sigma_dbh_cm")] = ""
+    for row in rows[:2]:
+        row[header.index("height_m")] = "20.00"
+    trees.write_text("\n".join(",".join(row) for row in (header, *rows)) + "\n")
+    names = ["trees", "trees_with_dbh", "trees_with_height", "trees_with_volume"]
+    if suffix == "shp":
+        names = ["trees", "trees_dbh", "trees_h", "trees_v"]
+    for words, volumes in (([], None), (["--volume", "0.001 * dbh_cm * height_m"], 1)):
+        file = tmp_path / f"{len(words)}.{suffix}"
+        told = stemmap(
+            capsys, "export", run, "--to", file, "--circle", "10,10,9", "--circle", "2,2,2", *words
+        )
+        assert told.code == 0, told.err
+        part, layer = (file, "plots") if suffix == "gpkg" else (tmp_path / f"{len(words)}_plots.shp", None)
+        with fiona.open(part, layer=layer) as table:
+            plot = list(table)[1].properties
+        assert [plot[name] for name in names] == [4, 3, 2, volumes]
+
+
 def test_qgis_finds_a_style_for_each_layer_and_the_file_is_sound(runs, tmp_path, capsys):
     file = exported(capsys, runs["utm"], tmp_path / "trees.gpkg")
     database = sqlite3.connect(file)
