@@ -233,7 +233,7 @@ function reviewText() {
   const references = annotations().some((row) => row.kind === "tree" && (row.dbh_cm !== null || treeNumberOf(row) === null));
   return [`Review: ${of.confirmed + of.rejected} of ${count(all, "found tree")} reviewed${states.length ? ` (${states.join(", ")})` : ""}.`,
     of.rejected && "Rejected trees do not count here.",
-    references && "Diameters by tape and trees that the map lacks are references for the scores; they do not count here."].filter(Boolean).join(" ");
+    references && "Diameters by tape and trees that the map lacks are references for the scores, and exported files have them; they do not count here."].filter(Boolean).join(" ");
 }
 
 // Another run begins with empty fields.
