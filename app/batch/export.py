@@ -32,7 +32,7 @@ from app.batch.map_frame import (
     read_map_frame,
     reproject,
 )
-from app.batch.run_folder import read_run, read_terrain
+from app.batch.run_folder import read_measured, read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import ROBOTS_FRAME, geojson
@@ -87,6 +87,7 @@ TREE_FIELDS = (
     Field("sigma_height_m", "sh_m", "m", "standard deviation of the height"),
     Field("lean_deg", "lean_deg", "deg", "angle of the stem from the vertical"),
     Field("review", "review", "", "state of the review: open, or confirmed or skipped by a person"),
+    Field("dbh_tape_cm", "dbh_tape", "cm", "diameter that a person measured by tape; empty without one"),
 )
 #: Fields of each layer.
 LAYER_FIELDS = {
@@ -95,6 +96,7 @@ LAYER_FIELDS = {
         Field("scans", "scans", "", "number of scans"),
         Field("length_m", "length_m", "m", "length of the path"),
     ),
+    "added": (Field("dbh_tape_cm", "dbh_tape", "cm", "diameter by tape of a tree that a person added"),),
 }
 
 
@@ -111,6 +113,9 @@ class ExportedRun:
             unknown values. `review` has texts.
         path: The path in the coordinates of `place`, shape (N, 2) [m].
         terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
+        added: Trees that a person added because the map lacks them, in the coordinates of `place`, shape
+            (M, 2) [m]. They are not in `trees`.
+        added_dbh: Their diameters by tape [cm], shape (M,); NaN where unknown.
     """
 
     uri: str
@@ -120,6 +125,8 @@ class ExportedRun:
     columns: dict[str, Any]
     path: Float
     terrain: Float
+    added: Float
+    added_dbh: Float
 
     @property
     def crs(self) -> str:
@@ -145,6 +152,9 @@ def read_for_export(folder: FilePath) -> ExportedRun:
     trees, path, terrain = run.trees, run.path, read_terrain(folder)
     ground = heights_at(terrain, trees.position) + frame.z
     unknown = np.full(len(trees.number), np.nan)
+    measured = read_measured(folder)
+    lacks = np.isnan(measured["of_tree"])
+    tape = dict(zip(measured["of_tree"].tolist(), measured["dbh_tape_cm"].tolist(), strict=True))
     values = (
         trees.number,
         100.0 * trees.dbh,
@@ -162,15 +172,19 @@ def read_for_export(folder: FilePath) -> ExportedRun:
         unknown if trees.height_sigma is None else trees.height_sigma,
         unknown if trees.lean is None else np.degrees(trees.lean),
         np.array(list(run.reviews.values()), np.str_),
+        np.array([tape.get(number, math.nan) for number in trees.number.tolist()], np.float64),
     )
-    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0)
+    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0, 1)
     columns = {
         field.name: np.round(v, d) if v.dtype.kind == "f" else v
         for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)
     }
     path_xy = frame.to_crs(np.stack([path.x, path.y], axis=1))
     place = frame.to_crs(trees.position)
-    return ExportedRun(run.uri, trees, frame, place, columns, path_xy, terrain)
+    added = frame.to_crs(np.stack([measured["x_m"], measured["y_m"]], axis=1)[lacks])
+    return ExportedRun(
+        run.uri, trees, frame, place, columns, path_xy, terrain, added, measured["dbh_tape_cm"][lacks]
+    )
 
 
 def export_run(run: R, file: FilePath, writers: Mapping[str, Writer[R]]) -> list[FilePath]:
@@ -229,8 +243,8 @@ def export_one_file(run: R, suffix: str, writers: Mapping[str, Writer[R]], folde
 
 def layers_of(run: ExportedRun) -> dict[str, Any]:
     """Return a dict from the name of each layer to its GeoDataFrame in the coordinates of the files: `trees`,
-    also without trees, and `path` if it has at least two positions. The columns are LAYER_FIELDS and the
-    geometry. Raises StemmapError if a package is not installed."""
+    also without trees, `path` if it has at least two positions, and `added` if there are any. The columns are
+    LAYER_FIELDS and the geometry. Raises StemmapError if a package is not installed."""
     geopandas = gis_package("geopandas", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -243,6 +257,10 @@ def layers_of(run: ExportedRun) -> dict[str, Any]:
             {"scans": [len(run.path)], "length_m": [round(length, 2)]},
             geometry=[shapely.LineString(run.path)],
             crs=run.crs,
+        )
+    if len(run.added):
+        layers["added"] = geopandas.GeoDataFrame(
+            {"dbh_tape_cm": run.added_dbh}, geometry=shapely.points(run.added), crs=run.crs
         )
     return layers
 
@@ -330,14 +348,41 @@ STYLES = {
         {"color": "47,125,50,255", "outline_color": "20,60,25,255", "size": "0.3", "size_unit": "MapUnit"},
     ),
     "path": qml("line", "SimpleLine", "", {"line_color": "31,90,180,255", "line_width": "0.4"}),
+    "added": qml(
+        "marker",
+        "SimpleMarker",
+        "",
+        {"color": "255,255,255,255", "outline_color": "20,60,25,255", "size": "2"},
+    ),
 }
 
 
 def trees_geojson(run: ExportedRun) -> str:
-    """Return the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map."""
+    """Return the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map. Where
+    people measured any, the trees have `dbh_tape_cm`, and those that they added follow, with the review
+    "added" and without a number."""
     lon_lat = reproject(run.place, run.frame.crs, WGS84) if run.frame.crs else None
     reviews = dict(zip(run.columns["tree"].tolist(), run.columns["review"].tolist(), strict=True))
-    return geojson(run.trees, 0, lon_lat=lon_lat, reviews=reviews)
+    text, tape = geojson(run.trees, 0, lon_lat=lon_lat, reviews=reviews), run.columns["dbh_tape_cm"]
+    if not (len(run.added) or np.isfinite(tape).any()):
+        return text
+    collection = json.loads(text)
+    for feature, dbh in zip(collection["features"], tape.tolist(), strict=True):
+        feature["properties"]["dbh_tape_cm"] = dbh if math.isfinite(dbh) else None
+    places = reproject(run.added, run.frame.crs, WGS84).round(8) if run.frame.crs else run.added.round(3)
+    collection["features"] += [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": place},
+            "properties": {
+                "tree": None,
+                "review": "added",
+                "dbh_tape_cm": dbh if math.isfinite(dbh) else None,
+            },
+        }
+        for place, dbh in zip(places.tolist(), run.added_dbh.tolist(), strict=True)
+    ]
+    return json.dumps(collection, indent=1) + "\n"
 
 
 def path_geojson(run: ExportedRun) -> str:

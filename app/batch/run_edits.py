@@ -17,12 +17,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.batch.run_folder import crs_unit, read_run
+from app.batch.run_folder import MEASURED, MEASURED_COLUMNS, crs_unit, read_run
 from app.store.records import FRAME, KINDS, SKIPPED, Content
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import write_texts
-from pipeline.io.result_files import CONFIRMED, OPEN, REJECTED, TREE_COLUMNS, csv_in_units, csv_text
+from pipeline.io.result_files import (
+    CONFIRMED,
+    OPEN,
+    REJECTED,
+    TREE_COLUMNS,
+    csv_in_units,
+    csv_text,
+    number_text,
+)
 
 if TYPE_CHECKING:
     from app.store.store import Store
@@ -60,6 +68,47 @@ def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Conte
     return found
 
 
+def measured_by_people(
+    numbers: Sequence[int], position: Float, contents: Iterable[Content]
+) -> tuple[dict[int, float], list[Content]]:
+    """Return the diameters by tape [m] by the number of the tree, and the annotations of trees that the map
+    lacks. An annotation belongs to a tree as in `reviews_of`; of several with a diameter the nearest one
+    counts.
+
+    Args:
+        numbers, position, contents: See `reviews_of`.
+    """
+    from scipy.spatial import cKDTree
+
+    trees = [content for content in contents if content.kind == "tree"]
+    if not trees or not len(numbers):
+        return {}, trees
+    distance, row = cKDTree(position).query([(content.x, content.y) for content in trees])
+    tape: dict[int, float] = {}
+    for k in np.argsort(-distance, kind="stable").tolist():  # the nearest one comes last
+        dbh = trees[k].dbh
+        if distance[k] < SAME_THING and dbh is not None:
+            tape[numbers[row[k]]] = dbh
+    return tape, [content for k, content in enumerate(trees) if distance[k] >= SAME_THING]
+
+
+def measured_text(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> str:
+    """Return the text of measured.csv, see `measured_by_people`; "" without rows.
+
+    Args:
+        numbers: See `reviews_of`.
+        position, contents: Trees and annotations in the coordinates of the files.
+    """
+    tape, added = measured_by_people(numbers, position, contents)
+    places = dict(zip(numbers, position.tolist(), strict=True))
+    rows = [(str(number), *places[number], dbh) for number, dbh in sorted(tape.items())]
+    rows += [("", each.x, each.y, np.nan if each.dbh is None else each.dbh) for each in added]
+    cells = [
+        (name, number_text(x, 3), number_text(y, 3), number_text(100.0 * d, 1)) for name, x, y, d in rows
+    ]
+    return csv_text(MEASURED_COLUMNS, cells) if cells else ""
+
+
 def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content] | None:
     """Return the annotations of a recording that review trees, in the frame of the map; None if it never had
     an annotation in this store, so that the reviews in the files of a run are those of another machine.
@@ -76,8 +125,8 @@ def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content] | N
 @contextmanager
 def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterator[FilePath]:
     """Yield a folder with the run of `folder` in which trees.csv has the reviews by annotations of its
-    recording, and no others; the folder itself if there are neither annotations nor reviews. A temporary
-    folder is removed afterwards; errors name `folder` instead.
+    recording, and no others, and measured.csv what people measured; the folder itself if there are neither
+    annotations nor reviews. A temporary folder is removed afterwards; errors name `folder` instead.
 
     Args:
         folder: Folder that `stemmap map` wrote.
@@ -90,7 +139,8 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
         yield folder
         return
     run = read_run(folder)  # checks the files
-    if not (contents or run.rejected or {*run.reviews.values()} - {OPEN}):
+    edited = contents or run.rejected or {*run.reviews.values()} - {OPEN} or (folder / MEASURED).is_file()
+    if not edited:
         yield folder
         return
     offset = run.record["source"].get("offset_m", (0.0, 0.0))
@@ -110,7 +160,10 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
         for name in _FILES:
             if (folder / name).is_file():
                 shutil.copy2(folder / name, FilePath(there) / name)  # with its date, which the report states
-        write_texts(FilePath(there), {"trees.csv": csv_text(TREE_COLUMNS, texts)})
+        written = {"trees.csv": csv_text(TREE_COLUMNS, texts)}
+        if measured := measured_text(numbers, position, placed):
+            written[MEASURED] = measured
+        write_texts(FilePath(there), written)
         try:
             yield FilePath(there)
         except StemmapError as error:

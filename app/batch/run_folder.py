@@ -40,6 +40,9 @@ from pipeline.seen_area import CELL, SeenArea
 from pipeline.types.records import Int, Path, Trees, TruthTrees
 
 LARGEST_FILE = 256 << 20
+#: What people measured: trees by tape, and trees that the map lacks, whose `of_tree` is empty.
+MEASURED = "measured.csv"
+MEASURED_COLUMNS = ("of_tree", "x_m", "y_m", "dbh_tape_cm")
 _FILES = (
     "trees.csv",
     "path.csv",
@@ -145,6 +148,17 @@ def read_terrain(folder: FilePath) -> Float:
     """
     c = _columns(folder / "terrain.csv", TERRAIN_COLUMNS)
     return np.stack([c["x_m"], c["y_m"], c["z_m"]], axis=1)
+
+
+def read_measured(folder: FilePath) -> dict[str, Float]:
+    """Return the columns of measured.csv by their names, shape (rows,) each; no rows without this file.
+
+    Raises:
+        SourceError: The file is damaged.
+    """
+    if not (folder / MEASURED).is_file():
+        return {name: np.zeros(0) for name in MEASURED_COLUMNS}
+    return _columns(folder / MEASURED, MEASURED_COLUMNS)
 
 
 #: Earlier times count from the start of a sensor [ns since 1970].

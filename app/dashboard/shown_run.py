@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -13,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.batch.map_frame import write_map_frame
-from app.batch.run_edits import reviews_of
-from app.batch.run_folder import as_written, recorded_time, score_map
+from app.batch.run_edits import measured_by_people, measured_text, reviews_of
+from app.batch.run_folder import MEASURED, as_written, recorded_time, score_map
 from app.batch.summary import far_truth, left_out_warning, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
@@ -23,7 +24,7 @@ from app.sources.request import SourceRequest
 from app.store.records import Annotation
 from app.worker.protocol import Shown, Status
 from pipeline.config import Parameters
-from pipeline.geometry.poses import Pose2
+from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import (
     PATH_COLUMNS,
@@ -117,15 +118,32 @@ class ShownRun:
     def reviews(self) -> dict[int, str]:
         """Return a dict from the number of each confirmed tree that has a review to this review, see
         `reviews_of`."""
+        return reviews_of(*self._numbered(), [row.content for row in self.edits])
+
+    def _numbered(self) -> tuple[list[int], Float]:
+        """Return the numbers and positions of the confirmed trees in the frame of the map."""
         trees = self.shown.frame.trees
-        place = trees.position[trees.confirmed]
-        return reviews_of(trees.number[trees.confirmed].tolist(), place, [row.content for row in self.edits])
+        return trees.number[trees.confirmed].tolist(), trees.position[trees.confirmed]
+
+    def _measured(self) -> dict[str, str]:
+        """Return the text of measured.csv by its name; {} if nobody measured a tree."""
+        numbers, position = self._numbered()
+        x, y = self.offset[:2]
+        contents = [replace(row.content, x=row.content.x + x, y=row.content.y + y) for row in self.edits]
+        text = measured_text(numbers, position + np.array([x, y]), contents)
+        return {MEASURED: self._in_units(text)} if text else {}
 
     def trees_text(self) -> str:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
-        coordinates of the files; with a reference system also their `easting_m` and `northing_m` in it."""
+        coordinates of the files; where any was measured by tape, with `dbh_tape_cm`; with a reference system
+        also their `easting_m` and `northing_m` in it."""
         trees = in_file(self.shown.frame.trees, self.one_step)
         names, rows = TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())
+        tape, _ = measured_by_people(*self._numbered(), [row.content for row in self.edits])
+        if tape:
+            names = (*names, "dbh_tape_cm")
+            known = (tape.get(number, math.nan) for number in self._numbered()[0])
+            rows = [(*row, number_text(100.0 * dbh, 1)) for row, dbh in zip(rows, known, strict=True)]
         if self.frame is not None and self.frame.content.values is not None:
             given = self.frame.content.values["frame"]
             pose = Pose2(given["east_m"], given["north_m"], given["turn_rad"])
@@ -154,9 +172,9 @@ class ShownRun:
             yield FilePath(name)
 
     def texts(self, *, with_seen: bool = True) -> dict[str, str]:
-        """Return a dict from the names trees.csv, path.csv, seen.csv (only if `with_seen`), terrain.csv and
-        run.json to the texts of these files. terrain.csv has only its header if the newest results have no
-        ground."""
+        """Return a dict from the names trees.csv, path.csv, seen.csv (only if `with_seen`), measured.csv (if
+        people measured trees), terrain.csv and run.json to the texts of these files. terrain.csv has only its
+        header if the newest results have no ground."""
         ground, offset = self.shown.frame.ground, self.offset
         cells = [] if ground is None else list(terrain_rows(ground))
         if self.one_step is not None:
@@ -168,6 +186,7 @@ class ShownRun:
             "trees.csv": self.trees_text(),
             "path.csv": csv_text(PATH_COLUMNS, path_rows(self.path, self.start_ns)),
             **({"seen.csv": self._in_units(seen_text(self._seen_area()))} if with_seen else {}),
+            **self._measured(),
             "terrain.csv": self._in_units(csv_text(TERRAIN_COLUMNS, cells)),
             "run.json": json.dumps(self._record(), indent=1) + "\n",
         }

@@ -95,20 +95,35 @@ class CsvTable:
         k = self.column.get(name, -1)
         return [row[k].strip() if 0 <= k < len(row) else "" for row in self.rows]
 
-    def numbers(self, name: str, *, required: bool = True) -> Float:
+    def numbers(
+        self, name: str, *, required: bool = True, faults: dict[int, SourceError] | None = None
+    ) -> Float:
         """Return the numbers of a column, shape (N,). If `required` is False, empty cells, "nan" and "na"
         (also in capitals) give NaN. A column that the table does not have counts as empty cells. In a column
         of a table with semicolons in which a cell has a comma, the comma is the decimal sign and a point is
         an error, because it may separate thousands.
+
+        Args:
+            name: Name of the column.
+            required: Whether an unknown number is an error.
+            faults: If given, the error of a cell is added by the index of its row, unless the row has one,
+                and the number is NaN.
 
         Raises:
             SourceError: A cell is not a finite number, or its magnitude is not less than COORDINATE_LIMIT.
         """
         texts = self.text(name)
         has_commas = self._has_semicolons and any("," in text for text in texts)
-        return np.array(
-            [self._number(text, name, k, required, has_commas) for k, text in enumerate(texts)], np.float64
-        )
+        found = []
+        for k, text in enumerate(texts):
+            try:
+                found.append(self._number(text, name, k, required, has_commas))
+            except SourceError as error:
+                if faults is None:
+                    raise
+                faults.setdefault(k, error)
+                found.append(math.nan)
+        return np.array(found, np.float64)
 
     def _number(self, text: str, name: str, row: int, required: bool, has_commas: bool) -> float:
         """Return the number of one cell, with the errors of `numbers`.

@@ -16,9 +16,9 @@ POINT_SIGMA = 0.125
 
 def _add_routes(app: FastAPI) -> None:
     """Add the routes to a dashboard."""
-    from app.extensions.stand.routes import files, georeference, plots, visits
+    from app.extensions.stand.routes import files, georeference, heading, plots, visits
 
-    for module in (plots, georeference, files, visits):
+    for module in (plots, georeference, heading, files, visits):
         app.include_router(module.router)
 
 

@@ -53,6 +53,7 @@ class PlotTrees:
         volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None if there is no volume
             formula.
         volume_shared: Part of `volume_sigma` by the error that all diameters share [m^3], or None.
+        height: Heights [m], NaN where unknown; None if no tree has one.
     """
 
     position: Float
@@ -61,11 +62,12 @@ class PlotTrees:
     volume: Float | None = None
     volume_sigma: Float | None = None
     volume_shared: Float | None = None
+    height: Float | None = None
 
     def where(self, keep: Bool) -> PlotTrees:
         """Return the rows for which `keep`, shape (T,), is true."""
-        volumes = (self.volume, self.volume_sigma, self.volume_shared)
-        kept = (None if column is None else column[keep] for column in volumes)
+        optional = (self.volume, self.volume_sigma, self.volume_shared, self.height)
+        kept = (None if column is None else column[keep] for column in optional)
         return PlotTrees(self.position[keep], self.dbh[keep], self.dbh_sigma[keep], *kept)
 
 
@@ -78,6 +80,7 @@ class StandFigures:
         trees: Number of trees of at least the minimum diameter in the observed part.
         without_dbh: Number of these trees without a diameter; they count with the mean basal area of the
             others.
+        with_height: Number of these trees with a height.
         with_volume: Number of these trees with a volume; None if there is no volume formula.
         detection: Mean probability that a tree in the observed part is found; its error is NaN if it is
             assumed.
@@ -85,7 +88,7 @@ class StandFigures:
             `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
             probability of detection; the others refer to the observed area.
         classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area. Empty, and
-            `trees` and `without_dbh` 0, if nothing was observed.
+            `trees` and the other numbers of trees 0, if nothing was observed.
         warnings: Messages for the user.
     """
 
@@ -93,6 +96,7 @@ class StandFigures:
     seen: float
     trees: int
     without_dbh: int
+    with_height: int
     with_volume: int | None
     detection: Estimate
     values: Mapping[str, Estimate]
@@ -174,6 +178,7 @@ def stand_figures(
         warnings.append(f"only {n} {'tree' if n == 1 else 'trees'}: the figures are uncertain")
     if missing:
         warnings.append(f"{missing} of {n} trees have no diameter; they count with the mean basal area")
+    heights = 0 if kept.height is None else int(np.count_nonzero(np.isfinite(kept.height)))
     volumes = None if kept.volume is None else int(np.count_nonzero(np.isfinite(kept.volume)))
     if volumes is not None and volumes < n:
         warnings.append(
@@ -185,7 +190,7 @@ def stand_figures(
     p, p_se = detection
     values = dict.fromkeys(FIGURES, Estimate())
     if seen <= 0.0:
-        return StandFigures(area, 0.0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
+        return StandFigures(area, 0.0, 0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
     every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
     plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))), 0.0)
     values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)
@@ -222,7 +227,9 @@ def stand_figures(
     values.update(_diameter_figures(kept, found, seen, parameters))
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _classes(kept, share, seen, parameters, math.isnan(p_se))
-    return StandFigures(area, seen, n, missing, volumes, Estimate(p, p_se), values, classes, tuple(warnings))
+    return StandFigures(
+        area, seen, n, missing, heights, volumes, Estimate(p, p_se), values, classes, tuple(warnings)
+    )
 
 
 def _is_unlike(inside: int, outside: int, share: float) -> bool:

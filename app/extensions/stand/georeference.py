@@ -167,8 +167,25 @@ NAME_MAX = 60  # characters of the name of a control point
 
 
 def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
-    """Return the control points of a table, in its order. A point with a tree has no x and y. A point without
-    a name gets the number of its tree or of its row as name. Whether the map has the trees is not checked.
+    """Return the control points of a table, see `read_point_rows`.
+
+    Raises:
+        SourceError: As there, or a row has a fault; that of the first such row.
+    """
+    points, faults = read_point_rows(file, crs)
+    if faults:
+        raise faults[min(faults)]
+    return points
+
+
+def read_point_rows(file: FilePath, crs: str) -> tuple[list[ControlPoint], dict[int, SourceError]]:
+    """Return the control points of a table, in its order, and the faults of its rows by their index: a cell
+    that is not a number, a tree that is not a whole number, neither a tree nor a place, or a name of more
+    than NAME_MAX characters.
+
+    A point with a tree has no x and y. A point without a name gets the number of its tree or of its row as
+    name. Whether the map has the trees is not checked. In a row with a fault, what could not be read is NaN,
+    or None where it may be, and the name is cut.
 
     Args:
         file: CSV with a header: lon and lat, or without a column lon easting and northing; tree, or x_m and
@@ -176,9 +193,8 @@ def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
         crs: Reference system, see `projected`, to which longitudes and latitudes are converted.
 
     Raises:
-        SourceError: The file cannot be read, is larger than 1 MB, has an incomplete header or row, a cell
-            that is not a number, a tree that is not a whole number, a name of more than NAME_MAX characters,
-            no rows or more than POINTS_MAX.
+        SourceError: The file cannot be read, is larger than 1 MB, has an incomplete header, no rows or more
+            than POINTS_MAX.
     """
     table = CsvTable.read(file, "table of control points", _LARGEST_FILE)
     if len(table.rows) > POINTS_MAX:
@@ -194,34 +210,47 @@ def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
         )
     if not table.rows:
         raise SourceError("the file has no control points", where=str(file))
-    known = np.stack([table.numbers(east), table.numbers(north)], axis=1)
+    faults: dict[int, SourceError] = {}
+    known = np.stack([table.numbers(name, faults=faults) for name in (east, north)], axis=1)
     if names[0] is _LON:
         known = reproject(known, WGS84, crs)
-    x, y, tree = (table.numbers(name, required=False) for name in ("x_m", "y_m", "tree"))
-    z = table.numbers(table.find(_HEIGHT) or "", required=False)
+        for k in np.flatnonzero(~np.isfinite(known).all(axis=1)).tolist():
+            known[k] = math.nan
+            what = f"line {table.lines[k]}: the reference system has no place for its lon and lat"
+            faults.setdefault(k, SourceError(what, where=str(file), remedy="Check both, and the EPSG code"))
+    x, y, tree, z = (
+        table.numbers(name, required=False, faults=faults)
+        for name in ("x_m", "y_m", "tree", table.find(_HEIGHT) or "")
+    )
     points = []
     for k, name in enumerate(table.text("name")):
-        number = None if math.isnan(tree[k]) else int(tree[k])
-        if number is not None and number != tree[k]:
-            raise SourceError(f"line {table.lines[k]}: the map has no tree {tree[k]}", where=str(file))
-        if number is None and not (math.isfinite(x[k]) and math.isfinite(y[k])):
-            raise SourceError(f"line {table.lines[k]}: it has no tree and no x_m and y_m", where=str(file))
-        if len(name) > NAME_MAX:
-            raise SourceError(
-                f"line {table.lines[k]}: the name has more than {NAME_MAX} characters", where=str(file)
-            )
+        number = int(tree[k]) if tree[k] == np.floor(tree[k]) and tree[k] > 0.0 else None
+        fault = ""
+        if number is None and math.isfinite(tree[k]):
+            fault = f"the map has no tree {tree[k]:g}"
+        elif number is None and not (math.isfinite(x[k]) and math.isfinite(y[k])):
+            fault = "it has no tree and no x_m and y_m"
+        elif len(name) > NAME_MAX:
+            fault = f"the name has more than {NAME_MAX} characters"
+        if fault:
+            faults.setdefault(k, SourceError(f"line {table.lines[k]}: {fault}", where=str(file)))
         points.append(
             ControlPoint(
-                name=name or str(k + 1 if number is None else number),
+                name=name[:NAME_MAX] or str(k + 1 if number is None else number),
                 east=float(known[k, 0]),
                 north=float(known[k, 1]),
                 tree=number,
-                x=float(x[k]) if number is None else None,
-                y=float(y[k]) if number is None else None,
-                z=float(z[k]) if math.isfinite(z[k]) else None,
+                x=_finite(x[k]) if number is None else None,
+                y=_finite(y[k]) if number is None else None,
+                z=_finite(z[k]),
             )
         )
-    return points
+    return points, faults
+
+
+def _finite(value: float) -> float | None:
+    """Return a number; None for NaN and infinity."""
+    return float(value) if math.isfinite(value) else None
 
 
 def by_control_points(

@@ -61,6 +61,9 @@ PLOT_FIELDS = (
     Field("area_m2", "area_m2", "m2", "area of the plot"),
     Field("seen_m2", "seen_m2", "m2", "observed part of the area"),
     Field("trees", "trees", "", "number of trees of at least the minimum diameter in the observed part"),
+    Field("trees_with_dbh", "trees_dbh", "", "number of these trees with a diameter"),
+    Field("trees_with_height", "trees_h", "", "number of these trees with a height"),
+    Field("trees_with_volume", "trees_v", "", "number of these trees with a volume; empty without a formula"),
     *_figure_fields(),
 )
 #: Fields of each layer.
@@ -98,7 +101,14 @@ def read_with_plots(folder: FilePath, of_plots: StandResult | None) -> PlottedRu
     if of_plots is not None:
         for plot in of_plots.plots:
             f = of_plots.figures[plot.name]
-            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": f.trees}
+            figures = {
+                "area_m2": f.area,
+                "seen_m2": f.seen,
+                "trees": f.trees,
+                "trees_with_dbh": f.trees - f.without_dbh,
+                "trees_with_height": f.with_height,
+                "trees_with_volume": math.nan if f.with_volume is None else f.with_volume,
+            }
             for name, estimate in f.values.items():
                 figures.update({name: estimate.value, f"{name}_se": estimate.se})
             shapes.append((plot.name, shapely.transform(plot.shape, run.frame.to_crs), figures))
@@ -172,7 +182,8 @@ def _write_shapefiles(run: PlottedRun, file: FilePath) -> None:
 
 
 def _write_dxf(run: PlottedRun, file: FilePath) -> None:
-    """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS and CONTOURS. A tree without a
+    """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS, CONTOURS and, if people added
+    trees, ADDED. A tree without a
     diameter is a point without a circle, one without a ground height has z 0. StemmapError if ezdxf or
     contourpy is not installed, or the terrain covers too large an area."""
     ezdxf = gis_package("ezdxf", "DXF files")
@@ -182,7 +193,10 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
         drawing = ezdxf.new("R2010", units=ezdxf.units.M)
         drawing.header.custom_vars.append("CRS", run.frame.name)
         drawing.header.custom_vars.append("Program", f"stemmap {version()}")
-        for layer, colour in (("TREES", 3), ("LABELS", 7), ("PATH", 5), ("PLOTS", 30), ("CONTOURS", 33)):
+        names = {"TREES": 3, "LABELS": 7, "PATH": 5, "PLOTS": 30, "CONTOURS": 33}
+        if len(run.added):
+            names["ADDED"] = 1
+        for layer, colour in names.items():
             drawing.layers.add(layer, color=colour)
         space = drawing.modelspace()
         columns = run.columns
@@ -195,6 +209,10 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
             text = f"{columns['tree'][k]}" + (f" {dbh:.0f}" if math.isfinite(dbh) else "")
             label = space.add_text(text, height=0.25, dxfattribs={"layer": "LABELS"})
             label.set_placement((x + 0.2, y + 0.2, z))
+        for (x, y), dbh in zip(run.added.tolist(), run.added_dbh.tolist(), strict=True):
+            space.add_point((x, y), dxfattribs={"layer": "ADDED"})
+            if math.isfinite(dbh):
+                space.add_circle((x, y), 0.005 * dbh, dxfattribs={"layer": "ADDED"})
         if len(run.path) > 1:
             space.add_lwpolyline(run.path.tolist(), dxfattribs={"layer": "PATH"})
         for name, shape, _ in run.plots:
@@ -214,8 +232,8 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
 
 
 def _write_xlsx(run: PlottedRun, file: FilePath) -> None:
-    """Write a workbook with the sheets trees, plots (if there are any), fields and about. StemmapError if
-    xlsxwriter is not installed."""
+    """Write a workbook with the sheets trees, added and plots (if there are any), fields and about.
+    StemmapError if xlsxwriter is not installed."""
     xlsxwriter = gis_package("xlsxwriter", "XLSX files")
     book = xlsxwriter.Workbook(str(file), {"nan_inf_to_errors": False, "strings_to_formulas": False})
     book.set_properties({"created": DATE.replace(tzinfo=None), "comments": f"stemmap {version()}"})
@@ -224,13 +242,16 @@ def _write_xlsx(run: PlottedRun, file: FilePath) -> None:
     place = {first: np.round(run.place[:, 0], 3), second: np.round(run.place[:, 1], 3)}
     number = run.columns["tree"]
     _sheet(book, "trees", {"tree": number, **place, **run.columns}, bold)
+    if len(run.added):
+        added = {name: np.round(run.added[:, axis], 3) for axis, name in enumerate((first, second))}
+        _sheet(book, "added", {**added, "dbh_tape_cm": run.added_dbh}, bold)
     if run.plots:
         _sheet(book, "plots", _plot_table(run), bold)
     axes = tuple(Field(name, "", "m", f"coordinate in {run.frame.name}") for name in (first, second))
     rows = [
         (field, layer)
         for layer, fields in LAYER_FIELDS.items()
-        for field in ((*fields, *axes) if layer == "trees" else fields)
+        for field in ((*fields, *axes) if layer in ("trees", "added") else fields)
     ]
     units = {
         "field": [field.name for field, _ in rows],

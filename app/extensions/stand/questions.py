@@ -12,9 +12,9 @@ from pipeline.errors import StemmapError
 if TYPE_CHECKING:
     from app.extensions.stand.plots import SamplePlot
 
-PLOTS_OF_FILE, GEOREFERENCE, REPORT, VISITS, EXPORT, LAYER, DETOUR = (
+PLOTS_OF_FILE, POINTS_OF_TABLE, GEOREFERENCE, REPORT, VISITS, EXPORT, LAYER, DETOUR = (
     f"{__name__}:{name}"
-    for name in ("plots", "georeference", "report", "visits", "export", "layer", "detour")
+    for name in ("plots", "points", "georeference", "report", "visits", "export", "layer", "detour")
 )
 
 
@@ -44,6 +44,28 @@ def plots(question: dict[str, Any]) -> dict[str, Any]:
     return {"plots": rows}
 
 
+def points(question: dict[str, Any]) -> dict[str, Any]:
+    """Return the control points of a table: `points`, a list of the fields of each `ControlPoint`, with None
+    for numbers that could not be read, and `faults`, a list of [index of the row, text].
+
+    Args:
+        question: The key "path" has the CSV file, and "crs" the reference system.
+
+    Raises:
+        StemmapError: The reference system is not valid, or see `read_point_rows`.
+    """
+    from math import isfinite
+
+    from app.extensions.stand import georeference as geo
+
+    found, faults = geo.read_point_rows(Path(question["path"]), geo.projected(question["crs"]))
+    rows = [asdict(point) for point in found]
+    for row in rows:
+        row.update({name: row[name] if isfinite(row[name]) else None for name in ("east", "north")})
+    texts = [[k, f"{fault.what}. {fault.remedy}".rstrip(". ")] for k, fault in sorted(faults.items())]
+    return {"points": rows, "faults": texts}
+
+
 def georeference(question: dict[str, Any]) -> dict[str, Any]:
     """Return the reference system of a map as a dict: `frame`, see `app.batch.map_frame.MapFrame.record`,
     and `points`, a list of the fields of each `ControlPoint` ([] for methods without control points). Nothing
@@ -51,9 +73,9 @@ def georeference(question: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         question: The key "path" has the folder of the run, "crs" the reference system, and "how" is
-            "control", with the control points as `points` or in the CSV file `table` ("" for none), and
-            `point_sigma` [m]; "gnss", with the time of the first scan as `start_ns`; or "hand", with the
-            position of the origin as `east`, `north` and `z` [m] and `turn_deg`.
+            "control", with the control points as `points`, and `point_sigma` [m]; "gnss", with the time of
+            the first scan as `start_ns`; or "hand", with the position of the origin as `east`, `north` and
+            `z` [m] and `turn_deg`.
 
     Raises:
         StemmapError: See `app.extensions.stand.georeference`.
@@ -64,8 +86,6 @@ def georeference(question: dict[str, Any]) -> dict[str, Any]:
     points: list[geo.ControlPoint] = []
     if how == "control":
         points = [geo.ControlPoint(**point) for point in question["points"]]
-        if question["table"]:
-            points = geo.read_control_points(Path(question["table"]), crs)
         frame = geo.by_control_points(folder, points, crs, question["point_sigma"])
     elif how == "gnss":
         frame = geo.by_gnss(folder, crs, question["start_ns"])
@@ -80,11 +100,13 @@ def report(question: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         question: The key "path" has the folder of the run, "file" the .html or .pdf file, "language" the
-            language of the report, and "plots" and "parameters" as in `export`.
+            language of the report, "heading" the fields of `Heading`, and "plots" and "parameters" as in
+            `export`.
 
     Raises:
         StemmapError, OSError: See `app.extensions.stand.report`.
     """
+    from app.extensions.stand.heading import Heading
     from app.extensions.stand.parameters import Stand
     from app.extensions.stand.report import report_page, write_report
 
@@ -93,6 +115,7 @@ def report(question: dict[str, Any]) -> dict[str, Any]:
         language=question["language"],
         plots=_plots_of(question),
         parameters=Stand.model_validate(question["parameters"]),
+        heading=Heading(**question["heading"]),
     )
     write_report(page, Path(question["file"]))
     return {}

@@ -168,7 +168,7 @@ def _plot_trees(trees: Trees, parameters: Stand) -> PlotTrees:
     """Return trees for stand figures, with volumes by a formula if it is not empty; raises StemmapError if it
     is not valid."""
     if not parameters.volume:
-        return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma)
+        return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, height=trees.height)
     unknown = np.full(len(trees.number), np.nan)
     height = unknown if trees.height is None else trees.height
     sigma = unknown if trees.height_sigma is None else trees.height_sigma
@@ -176,7 +176,7 @@ def _plot_trees(trees: Trees, parameters: Stand) -> PlotTrees:
     volume = formula.with_sigma(trees.dbh, trees.dbh_sigma, height, sigma)
     shared = np.minimum(np.nan_to_num(trees.dbh_sigma), parameters.dbh_shared_sigma)
     _, volume_shared = formula.with_sigma(trees.dbh, shared, height, unknown)
-    return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, *volume, volume_shared)
+    return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, *volume, volume_shared, height)
 
 
 def extent_words(points: np.ndarray) -> str:
@@ -191,6 +191,7 @@ PLOT_COLUMNS = (
     "seen_m2",
     "trees",
     "trees_without_dbh",
+    "trees_with_height",
     "trees_with_volume",
     "detection",
     "detection_se",
@@ -206,7 +207,8 @@ def stand_files(result: StandResult) -> dict[str, str]:
     header = (*PLOT_COLUMNS, *(f"{name}{end}" for name in FIGURES for end in ("", "_se")))
     rows = []
     for name, f in result.figures.items():
-        about = [name, f"{f.area:.2f}", f"{f.seen:.2f}", str(f.trees), str(f.without_dbh)]
+        about = [name, f"{f.area:.2f}", f"{f.seen:.2f}"]
+        about += [str(number) for number in (f.trees, f.without_dbh, f.with_height)]
         about.append("" if f.with_volume is None else str(f.with_volume))
         rows.append([*about, *_numbers(f.detection), *_cells(dict(f.values))])
     if len(result.figures) > 1:
@@ -237,9 +239,9 @@ def stand_record(result: StandResult) -> dict[str, Any]:
     - `detection_not_estimated`: the reason, see `DetectionFunction`, "" if it is estimated;
     - `units`: dict from each stand parameter to its unit;
     - `plots`: dict from the name of each plot to a dict with `area_m2`, `seen_m2`, `trees`,
-    `trees_without_dbh`, `trees_with_volume` (None if unknown), `detection` (a stand parameter), the other
-    stand parameters by name, and `classes`, a list of dicts with `from_cm`, `to_cm`, `trees`, `n_ha` and
-    `g_ha`;
+    `trees_without_dbh`, `trees_with_height`, `trees_with_volume` (None if unknown), `detection` (a stand
+    parameter), the other stand parameters by name, and `classes`, a list of dicts with `from_cm`, `to_cm`,
+    `trees`, `n_ha` and `g_ha`;
     - `mean`: dict from each stand parameter to its mean over all plots.
     """
     return {
@@ -258,6 +260,7 @@ def stand_record(result: StandResult) -> dict[str, Any]:
                 "seen_m2": round(f.seen, 3),
                 "trees": f.trees,
                 "trees_without_dbh": f.without_dbh,
+                "trees_with_height": f.with_height,
                 "trees_with_volume": f.with_volume,
                 "detection": _pair(f.detection),
                 **{key: _pair(value) for key, value in f.values.items()},

@@ -8,7 +8,8 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from app.batch.run_edits import SAME_THING, reviewed_run, reviews_of
+from app.batch.export import read_for_export, trees_geojson
+from app.batch.run_edits import SAME_THING, measured_by_people, reviewed_run, reviews_of
 from app.batch.run_folder import read_run, read_terrain
 from app.store.records import FRAME, SKIPPED, Author, Content
 from app.store.store import Store
@@ -35,6 +36,38 @@ PLACES = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
 def test_the_nearest_annotation_decides(contents, reviews):
     assert reviews_of([1, 2, 3], PLACES, contents) == reviews
     assert reviews_of([], np.zeros((0, 2)), contents) == {}
+
+
+def test_the_nearest_tape_counts_and_what_is_far_from_trees_is_added():
+    far = Content(0.0, SAME_THING + 0.01, "tree", 0.4)
+    contents = [
+        Content(0.0, 0.0),
+        Content(0.0, 0.3, "tree", 0.21),
+        Content(0.0, 0.2, "tree", 0.22),
+        Content(2.0, 0.0, "pole", 0.5),
+        Content(9.0, 9.0, "pole"),
+        far,
+    ]
+    assert measured_by_people([1, 2, 3], PLACES, contents) == ({1: 0.22}, [far])
+    assert measured_by_people([], np.zeros((0, 2)), [far]) == ({}, [far])
+
+
+def test_what_people_measured_is_exported_beside_the_map(tmp_path):
+    folder = grid_run(tmp_path / "run")
+    x, y = read_run(folder).trees.position[4].tolist()
+    contents = [Content(x, y, "tree", 0.234), Content(2.0, 2.0, "tree", 0.31), Content(4.0, 2.0)]
+    with reviewed_run(folder, contents) as reviewed:
+        run = read_for_export(reviewed)
+        features = json.loads(trees_geojson(run))["features"]
+        with reviewed_run(reviewed, []) as again:
+            assert len(read_for_export(again).added) == 0
+    assert np.flatnonzero(np.isfinite(run.columns["dbh_tape_cm"])).tolist() == [4]
+    assert (run.columns["dbh_tape_cm"][4], run.columns["dbh_cm"][4]) == (23.4, 20.0)
+    np.testing.assert_allclose(run.added, [[2.0, 2.0], [4.0, 2.0]])
+    np.testing.assert_array_equal(run.added_dbh, [31.0, np.nan])
+    assert [feature["properties"]["dbh_tape_cm"] for feature in features[3:5]] == [None, 23.4]
+    assert [feature["properties"]["review"] for feature in features[-3:]] == ["open", "added", "added"]
+    assert features[-2]["geometry"]["coordinates"] == [2.0, 2.0]
 
 
 def test_a_rejected_tree_stays_in_the_table_and_counts_nowhere(tmp_path):

@@ -124,6 +124,24 @@ def test_a_typed_rectangle_is_a_plot(person: Dashboard) -> None:
     person.until_server("/api/annotations", "!it.others.plot?.length")
 
 
+def test_the_heading_of_the_report_is_typed_once(person: Dashboard) -> None:
+    page = person.page
+    fields = page.locator("#report-heading input")
+    fields.nth(0).fill("Hohe Warte <3b>")
+    fields.nth(0).press("Tab")
+    fields.nth(2).fill("Ann")
+    fields.nth(2).press("Enter")
+    person.until_server("/api/annotations", "it.others.heading?.[0].author === 'Ann'")
+    with page.expect_download() as download:
+        page.locator("#plots-report").select_option("en.html")
+    text = download.value.path().read_text(encoding="utf-8")
+    assert "Hohe Warte &lt;3b&gt;" in text
+    page.locator("#plot-undo").click()
+    expect(fields.nth(2)).to_have_value("")
+    page.locator("#plot-undo").click()
+    expect(fields.nth(0)).to_have_value("")
+
+
 def test_another_run_begins_with_empty_fields(person: Dashboard) -> None:
     page = person.page
     page.get_by_text("Type a plot").click()

@@ -23,6 +23,7 @@ from app.batch.map_frame import MapFrame
 from app.common.text import version
 from app.extensions.stand.figures import FIGURES, Estimate
 from app.extensions.stand.gis_files import PlottedRun, read_with_plots
+from app.extensions.stand.heading import Heading
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plots import SamplePlot
 from app.extensions.stand.run_figures import StandResult, stand_of
@@ -110,6 +111,8 @@ def report_page(
     language: str = "en",
     plots: Sequence[SamplePlot] = (),
     parameters: Stand | None = None,
+    heading: Heading | None = None,
+    date: datetime.date | None = None,
 ) -> str:
     """Return the report of a run as the text of one HTML file without scripts or links. Nothing is written.
 
@@ -118,6 +121,8 @@ def report_page(
         language: A language of texts.toml: "en" or "de".
         plots: Plots in the frame of the map; without any, only the whole observed area is reported.
         parameters: Parameters of the stand figures; None for the defaults.
+        heading: Stand, client and author; None for none.
+        date: Date of the report; None for today.
 
     Raises:
         StemmapError: The language is unknown, a file of the run is missing or damaged, or stand figures are
@@ -147,6 +152,8 @@ def report_page(
         number=number,
         digits=_digits,
         version=version(),
+        heading=heading or Heading(),
+        date=(date or datetime.date.today()).strftime(texts["date"]),
         record=record,
         run=run,
         whole=whole,

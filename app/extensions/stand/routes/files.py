@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import asdict
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
@@ -14,6 +15,7 @@ from starlette.responses import Response
 from app.batch.run_folder import read_run_record
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.shown_run import ShownRun
+from app.extensions.stand.heading import Heading, heading_of, stored_heading
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plot_files import plots_of_run, stored_plots
 from app.extensions.stand.plots import SamplePlot
@@ -69,11 +71,11 @@ async def report(
     parameters: FigureParameters,
     language: Literal["en", "de"] = "en",
 ) -> Response:
-    """Return the report of `stemmap report` for a run with its plots; a child process writes it. The key is
-    the number of a record, "folder:NAME", or "open" for the open run. 404 for an unknown run, 409 if there is
-    no report of it, as no PDF without Chromium."""
+    """Return the report of `stemmap report` for a run with its plots and heading; a child process writes it.
+    The key is the number of a record, "folder:NAME", or "open" for the open run. 404 for an unknown run, 409
+    if there is no report of it, as no PDF without Chromium."""
     async with run_folder(key, settings, dashboard) as folder:
-        plots = await _plots_of(key, folder, dashboard)
+        plots, heading = await _edits_of(key, folder, dashboard)
         with TemporaryDirectory(prefix="stemmap-report-") as there:
             file = FilePath(there) / f"report.{suffix}"
             question = {
@@ -81,6 +83,7 @@ async def report(
                 "path": str(folder),
                 "file": str(file),
                 "language": language,
+                "heading": asdict(heading),
                 **_of_plots(plots, parameters),
             }
             await opening.ask(question, patience_s=_REPORT_S)
@@ -95,9 +98,13 @@ def _of_plots(plots: list[SamplePlot], parameters: Stand) -> dict[str, Any]:
     }
 
 
-async def _plots_of(key: str, folder: FilePath, dashboard: Dashboard) -> list[SamplePlot]:
-    """Return the plots of a run by its key and its folder; StemmapError if the store cannot be used."""
+async def _edits_of(key: str, folder: FilePath, dashboard: Dashboard) -> tuple[list[SamplePlot], Heading]:
+    """Return the plots and the heading of a run by its key and its folder; StemmapError if the store cannot
+    be used."""
     if is_open_run(key, dashboard):
-        return plots_of_run(ShownRun.of(dashboard))
+        run = ShownRun.of(dashboard)
+        return plots_of_run(run), heading_of(row.content for row in run.edits)
     source = (await asyncio.to_thread(read_run_record, folder))["source"]
-    return await dashboard.store.ask(lambda store: stored_plots(store, source))
+    return await dashboard.store.ask(
+        lambda store: (stored_plots(store, source), stored_heading(store, source))
+    )

@@ -5,7 +5,9 @@ It is an annotation of the class `frame`: undo, redo and deletion are routes of 
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter
@@ -15,11 +17,11 @@ from starlette.responses import Response
 from app.dashboard.shown_run import ShownRun
 from app.extensions.stand import POINT_SIGMA
 from app.extensions.stand.georeference import NAME_MAX
-from app.extensions.stand.questions import GEOREFERENCE
+from app.extensions.stand.questions import GEOREFERENCE, POINTS_OF_TABLE
 from app.sources import opening
 from app.store.records import FRAME, Content
 from app.store.store import Store
-from app.web.responses import BadRequestError, Body, Number, as_bad_request
+from app.web.responses import BadRequestError, Body, Number, as_bad_request, json_reply
 from app.web.routes.access import Dash, Edit, Metres, apply_edit, edited, in_thread
 from pipeline.io.readers.base import COORDINATE_LIMIT
 
@@ -45,11 +47,10 @@ class _ControlPoint(Body):
 
 
 class _ControlPoints(Body):
-    """Two or more points, or a CSV table of them as text."""
+    """Two or more points."""
 
     how: Literal["control"]
     points: Annotated[list[_ControlPoint], Field(max_length=_MOST_POINTS, default_factory=list)]
-    table: Annotated[str, Field(max_length=1_000_000)] = ""
     point_sigma: Annotated[float, Field(gt=0.0, le=100.0)] = POINT_SIGMA
 
 
@@ -67,9 +68,41 @@ class _ByHand(Body):
     z: _Coordinate = 0.0
 
 
+_Crs = Annotated[str, Field(min_length=1, max_length=_LONGEST_CRS)]
+
+
+class _Table(Body):
+    """A CSV table of control points as text."""
+
+    crs: _Crs
+    table: Annotated[str, Field(max_length=1_000_000)]
+
+
 class _Georeference(Edit):
-    crs: Annotated[str, Field(min_length=1, max_length=_LONGEST_CRS)]
+    crs: _Crs
     by: Annotated[_ControlPoints | _Gnss | _ByHand, Field(discriminator="how")]
+
+
+@router.post("/georeference/points")
+async def points_of_table(body: _Table, dashboard: Dash) -> Response:
+    """Return the control points of a table, which a child process reads, without storing them: `points`, with
+    the fields of `_ControlPoint` and null for what could not be read, and `faults`, a list of [index of the
+    point, text]. 422 if the table has too many points or another fault than those of single rows."""
+    with TemporaryDirectory(prefix="stemmap-points-") as folder:
+        file = FilePath(folder) / "points.csv"
+        await asyncio.to_thread(file.write_text, body.table, encoding="utf-8")
+        with as_bad_request(where=""):
+            found = await opening.ask({"ask": POINTS_OF_TABLE, "path": str(file), "crs": body.crs.strip()})
+    if len(found["points"]) > _MOST_POINTS:
+        raise BadRequestError(
+            f"a run can have at most {_MOST_POINTS} control points",
+            remedy="Leave some out, or use stemmap georeference --control FILE",
+        )
+    x, y = dashboard.offset
+    for point in found["points"]:
+        if point["x"] is not None and point["y"] is not None:
+            point.update(_placed(point, (-x, -y)))
+    return json_reply(found)
 
 
 @router.put("/georeference")
@@ -77,7 +110,7 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
     """Find the reference system of the map as `stemmap georeference` does, in a child process, and store it
     in one edit, in place of the one before; files and figures have it from then on. Return the counts of
     edits, see `edited`. 409 before the first map, or if another run was opened or the reference system was
-    changed meanwhile; 422 if there are too many points, or the values contradict one another or do not fit
+    changed meanwhile; 422 if the values contradict one another or do not fit
     the reference system."""
     run, by = ShownRun.of(dashboard), body.by.model_dump()
     offset = dashboard.offset
@@ -85,23 +118,15 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
         question: dict[str, Any] = {"ask": GEOREFERENCE, "path": str(folder), "crs": body.crs.strip(), **by}
         if isinstance(body.by, _ControlPoints):
             question["points"] = [_named(point, k, offset) for k, point in enumerate(by["points"], 1)]
-            if body.by.table:
-                question["table"] = str(folder / "points.csv")
-                FilePath(question["table"]).write_text(body.by.table, encoding="utf-8")
         elif isinstance(body.by, _Gnss):
             question["start_ns"] = run.start_ns
         with as_bad_request(where=""):
             found = await opening.ask(question, patience_s=_GNSS_PATIENCE_S)
     points = [_named(point, 0, (-offset[0], -offset[1])) for point in found["points"]]
-    if len(points) > _MOST_POINTS:
-        raise BadRequestError(
-            f"a run can have at most {_MOST_POINTS} control points",
-            remedy="Leave some out, or use stemmap georeference --control FILE",
-        )
     crs = found["frame"]["crs"]
     if len(crs) > _LONGEST_CRS:  # WKT; what was typed can be sent again
         crs = body.crs.strip()
-    values = {**by, "table": "", "points": points, "crs": crs, "frame": found["frame"]}
+    values = {**by, "points": points, "crs": crs, "frame": found["frame"]}
     content, before = Content(0.0, 0.0, FRAME, None, values), dashboard.annotation_editor.frame
     if before is None:
         await apply_edit(dashboard, body, Store.add, [content])
@@ -128,5 +153,9 @@ def _named(point: dict[str, Any], number: int, offset: tuple[float, float]) -> d
             f"point {point['name'] or number} has no place on the map",
             remedy="Pick it on the map, or name a tree",
         )
-    place = {"x": round(point["x"] + offset[0], 6), "y": round(point["y"] + offset[1], 6)}
-    return {**point, "name": point["name"] or str(number), **place}
+    return {**point, "name": point["name"] or str(number), **_placed(point, offset)}
+
+
+def _placed(point: dict[str, Any], offset: tuple[float, float]) -> dict[str, float]:
+    """Return `x` and `y` of a point with an offset, rounded to micrometres."""
+    return {"x": round(point["x"] + offset[0], 6), "y": round(point["y"] + offset[1], 6)}

@@ -2,6 +2,7 @@
 // of the map. Files, plots and the report have it then.
 
 import { draft, edit, news, remove, send } from "../../annotate/annotations.js";
+import { post } from "../../core/api.js";
 import { inFile, inMap, unitNode } from "../../core/coordinates.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
 import { count, fixed, NONE } from "../../core/format.js";
@@ -11,10 +12,12 @@ import { draw, plotting, sketch } from "./plots.js";
 const HOW = { control: "control points", gnss: "GNSS fixes of the recording", hand: "values by hand", file: "coordinates of the file, already in the system" };
 const HAND = [["east", "east m", "East of the map's origin, m"], ["north", "north m", "North of the map's origin, m"],
   ["turn_deg", "turn °", "Angle of the map's x axis from east to north, °"], ["z", "height m", "Height of the map's zero, m"]];
-const COLUMNS = [["name", "point", "Name of the point"], ["x", "x", "x in the coordinates of the files"], ["y", "y", "y in the coordinates of the files"], ["east", "east m", "East in the reference system"],
+const COLUMNS = [["name", "point", "Name of the point"], ["tree", "tree", "Number of the tree at the point; empty for another mark"], ["x", "x", "x in the coordinates of the files"], ["y", "y", "y in the coordinates of the files"], ["east", "east m", "East in the reference system"],
   ["north", "north m", "North in the reference system"], ["z", "height m", "Height in the reference system; may be empty"]];
 const PLACE = ["x", "y"];
 const POINT_SIGMA = 0.125; // m, that of the command line
+
+const MOST_FAULTS = 3; // in a message
 
 let points = []; // {name, tree, x, y, east, north, z}: the place of a tree is that of its number in the map
 let shown = ""; // what was loaded of the stored reference system
@@ -90,11 +93,33 @@ async function apply(by) {
   load();
 }
 
+// Empty texts in place of unknown numbers, and of a name that is only the number of the tree.
+const typed = ({ tree, name, ...of }) => ({ ...Object.fromEntries(Object.entries(of).map(([each, value]) => [each, value ?? ""])), tree, name: name === String(tree) ? "" : name });
+
+// Fills the table with the rows of a file, so that a wrong one can be mended here, and applies them if all could be read.
+async function importTable(table) {
+  const crs = byId("coordinates-crs").value.trim();
+  if (!crs) return fail("Name the reference system, such as EPSG:25832.");
+  let read;
+  try {
+    read = await post("/api/georeference/points", { crs, table });
+  } catch (error) {
+    return fail(error.message);
+  }
+  points = read.points.map(typed);
+  byId("coordinates-how").value = "control";
+  changed();
+  if (!read.faults.length) return apply(asked());
+  const texts = read.faults.slice(0, MOST_FAULTS).map(([row, text]) => `point ${titleOf(points[row], row)}, ${text}`);
+  const more = read.faults.length - texts.length;
+  return fail(`${texts.join("; ")}${more ? `; and ${count(more, "more row")}` : ""}. Correct ${read.faults.length > 1 ? "them" : "it"} in the table, then press Apply.`);
+}
+
 // --- the controls ---------------------------------------------------------------------------------------------------
 
 function build() {
   const file = el("input", { type: "file", accept: ".csv,.txt", hidden: true, "aria-label": "File of control points", onchange: async () => {
-    if (file.files.length) await apply({ how: "control", table: await file.files[0].text() });
+    if (file.files.length) await importTable(await file.files[0].text());
     file.value = "";
   } });
   const input = (name, title, value = "") => el("input", { id: `coordinates-${name}`, type: "number", step: "any", value, title, "aria-label": title, oninput: changed });
@@ -139,6 +164,8 @@ function fillResiduals() {
 }
 
 function cell(point, row, name, title) {
+  if (name === "tree") return el("td", {}, el("input", { name, type: "number", min: "1", step: "1", value: point.tree ?? "", title, "aria-label": `${title} of point ${row + 1}`,
+    onchange: ({ target }) => { point.tree = number(target.value); changed(); } })); // the place is then that of the tree
   const axis = PLACE.indexOf(name);
   const known = number((point.tree === null ? point : treeOf(point.tree))?.[name] ?? "");
   const written = axis < 0 || known === null ? null : inFile(known, known)[axis];
@@ -180,7 +207,7 @@ function load() {
   if (version.split(" ")[0] !== shown.split(" ")[0]) reset(); // of another run
   if (!dirty && version !== shown) {
     shown = version;
-    points = (found?.points ?? []).map((point) => ({ ...point, name: point.name === String(point.tree) ? "" : point.name, z: point.z ?? "" }));
+    points = (found?.points ?? []).map(typed);
     if (found) {
       byId("coordinates-crs").value = found.crs;
       byId("coordinates-how").value = found.frame.method === "file" ? "file" : found.how;

@@ -11,6 +11,7 @@ import { isDrive, on, state, trees } from "../../core/store.js";
 import { keepFresh } from "../../core/timing.js";
 import { titleOf } from "../../open/run_title.js";
 import { startCoordinates } from "./coordinates.js";
+import { fillHeading, headingFields, headingSaved } from "./heading.js";
 import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plots, plotting, SHAPES, sketch, stopDrawing } from "./plots.js";
 import { reportMenu } from "./report.js";
 
@@ -99,7 +100,7 @@ function build() {
     el("div", { id: "plots-edit", "data-edits": true },
       el("div", { class: "annotate-head" }, el("span", { class: "dim", text: "Draw" }),
         ...Object.entries(SHAPES).map(([kind, text]) => button(`plot-${kind}`, text, `Draw a ${kind} on the map`, () => draw(kind))), el("span", { class: "grow" }),
-        button("plot-undo", "Undo", "Undo your last edit of plots or coordinates (Ctrl+Z)", undo), button("plot-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
+        button("plot-undo", "Undo", "Undo your last edit of plots, coordinates or the heading (Ctrl+Z)", undo), button("plot-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
       el("details", { class: "plot-more" }, el("summary", { id: "plots-more" }), typed(), alongPath(), imported()),
       el("details", { id: "coordinates", class: "plot-more" })),
     el("p", { id: "plots-hint", class: "note dim", role: "status" }), el("p", { id: "plots-error", class: "error", role: "alert", hidden: true }),
@@ -109,7 +110,8 @@ function build() {
     el("ul", { id: "plots-warnings", class: "plots-warnings", "aria-label": "Warnings about the figures" }),
     el("div", { class: "plot-form" }, setting("dbh-min", "count trees from", threshold(), "Minimum DBH, cm", "number"), "cm DBH",
       setting("volume", "volume m³ =", formula(), "Volume of a stem in m³ as a formula of dbh_cm and height_m, with + - * / ^ ( ) exp log sqrt; empty: no volume", "text", "0.00007 * dbh_cm^1.8 * height_m^0.95")),
-    el("div", { class: "plot-form" }, reportMenu("plots-report", "open", () => titleOf(state.status?.source), settings), el("span", { text: "with map, plots, figures and list of trees" })));
+    headingFields(),
+    el("div", { class: "plot-form" }, reportMenu("plots-report", "open", () => titleOf(state.status?.source), async () => { await headingSaved(); return settings(); }), el("span", { text: "with map, plots, figures and list of trees" })));
 }
 
 // --- the table --------------------------------------------------------------------------------------------------------
@@ -231,7 +233,7 @@ function reviewText() {
   const references = annotations().some((row) => row.kind === "tree" && (row.dbh_cm !== null || treeNumberOf(row) === null));
   return [`Review: ${of.confirmed + of.rejected} of ${count(all, "found tree")} reviewed${states.length ? ` (${states.join(", ")})` : ""}.`,
     of.rejected && "Rejected trees do not count here.",
-    references && "Diameters by tape and trees that the map lacks are references for the scores; they do not count here."].filter(Boolean).join(" ");
+    references && "Diameters by tape and trees that the map lacks are references for the scores, and exported files have them; they do not count here."].filter(Boolean).join(" ");
 }
 
 // Another run begins with empty fields.
@@ -263,6 +265,7 @@ function fill() {
   byId("plots-warnings").replaceChildren(...warnings.map((text) => el("li", { text })));
   setText(byId("plots-detection"), detectionText());
   setText(byId("plots-review"), reviewText());
+  fillHeading();
   fillTable();
   byId("plots-table").classList.toggle("old", figures.all !== null && shown[0] !== edition());
 }

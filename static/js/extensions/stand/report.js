@@ -23,7 +23,7 @@ export function reportMenu(id, key, title, settings) {
     const choice = menu.value;
     menu.value = "";
     menu.disabled = true;
-    await saveReport(key, title(), choice, settings?.());
+    await saveReport(key, title(), choice, await settings?.());
     menu.disabled = false;
   } }, el("option", { value: "", text: "Report", selected: true }), ...reports().map(([value, text]) => el("option", { value, text })));
   return menu;

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import zipfile
 from pathlib import Path
 
+import geopandas
 import numpy as np
 import pytest
 
@@ -34,6 +36,29 @@ async def test_an_export_that_the_map_lacks_is_refused(both: Running) -> None:
     terrain = await client.get("/api/export/tif")
     assert terrain.status_code == 422
     assert "no terrain" in terrain.text
+
+
+async def test_what_people_measured_is_in_the_files_of_the_page(both: Running, tmp_path: Path) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    assert "dbh_tape_cm" not in (await client.get("/api/trees.csv")).text
+    assert dashboard.shown is not None
+    trees = dashboard.shown.frame.trees
+    x, y = trees.position[trees.confirmed][0].tolist()
+    run = (await client.get("/api/annotations")).json()["run"]
+    for place in ((x, y, 23.4), (x + 50.0, y, None)):
+        fields = dict(zip(("x", "y", "dbh_cm"), place, strict=True))
+        body = {"run": run, "browser": "a" * 16, "who": "Ann", "kind": "tree", **fields}
+        assert (await client.post("/api/annotations", json=body)).status_code == 201
+    (first, *others) = csv.DictReader((await client.get("/api/trees.csv")).text.splitlines())
+    assert (first["dbh_tape_cm"], first["review"]) == ("23.4", "confirmed")
+    assert {row["dbh_tape_cm"] for row in others} <= {""}
+    file = tmp_path / "trees.gpkg"
+    file.write_bytes((await client.get("/api/export/gpkg")).content)
+    layer = geopandas.read_file(file, layer="trees")
+    assert layer["dbh_tape_cm"][0] == 23.4
+    added = geopandas.read_file(file, layer="added")
+    assert added.geometry.x.tolist() == pytest.approx([x + 50.0], abs=1e-3)
 
 
 async def test_plots_are_a_layer_for_other_programs(both: Running) -> None:

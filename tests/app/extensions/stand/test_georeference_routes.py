@@ -36,6 +36,10 @@ async def put(client: httpx.AsyncClient, crs: str = UTM, **by: Any) -> httpx.Res
     return await client.put("/api/georeference", json={**edit, "crs": crs, "by": by}, timeout=60.0)
 
 
+async def read_table(client: httpx.AsyncClient, table: str) -> httpx.Response:
+    return await client.post("/api/georeference/points", json={"crs": UTM, "table": table}, timeout=60.0)
+
+
 async def stored(client: httpx.AsyncClient) -> dict[str, Any] | None:
     found: dict[str, Any] | None = (await client.get("/api/annotations")).json()["frame"]
     return found
@@ -91,10 +95,51 @@ async def test_control_points_place_the_files_as_on_the_command_line(both, tmp_p
     assert "EPSG:25832" in (await client.get("/api/runs/open/report/html", timeout=60.0)).text
 
     # The same points as a table give the same frame; so does the page's frame on the command line.
-    assert (await put(client, how="control", table=file.read_text())).status_code == 200
+    read = (await read_table(client, file.read_text())).json()
+    assert read["faults"] == []
+    assert (await put(client, how="control", points=read["points"])).status_code == 200
     again = await stored(client)
     assert again is not None
     assert (again["frame"], again["points"]) == (found["frame"], found["points"])
+
+
+async def test_rows_of_a_table_are_kept_where_others_are_wrong(both) -> None:
+    client, _ = both
+    table = (
+        "name,tree,x_m,y_m,lon,lat\nA,1,,,9.0,48.0\nB,2,,,9.O,48.0\nC,,,,9.0,48.0\n,1.5,,,9,48\n,,1,2,9,95\n"
+    )
+    read = (await read_table(client, table)).json()
+    assert [text for _, text in read["faults"]] == [
+        "line 3: lon = '9.O' is not a number",
+        "line 4: it has no tree and no x_m and y_m",
+        "line 5: the map has no tree 1.5",
+        "line 6: the reference system has no place for its lon and lat. Check both, and the EPSG code",
+    ]
+    assert [row for row, _ in read["faults"]] == [1, 2, 3, 4]
+    a, b, c, _, e = read["points"]
+    assert (a["tree"], a["east"], a["north"]) == (1, pytest.approx(5e5), pytest.approx(5316300.0, abs=1000.0))
+    assert (b["name"], b["tree"], b["east"], b["north"]) == ("B", 2, None, None)
+    assert (c["name"], c["tree"], c["x"], c["east"]) == ("C", None, None, a["east"])
+    assert (e["x"], e["y"], e["east"]) == (1.0, 2.0, None)
+    assert await stored(client) is None
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("tree,easting\n1,2\n", "header"),
+        ("tree,easting,northing\n", "no control points"),
+        (
+            "x_m,y_m,easting,northing\n" + "".join(f"{k},0,{500000 + k},5300000\n" for k in range(201)),
+            "at most 200 control points",
+        ),
+    ],
+)
+async def test_a_table_without_points_that_could_be_kept_is_refused(both, table: str, words: str) -> None:
+    client, _ = both
+    refused = await read_table(client, table)
+    assert (refused.status_code, words in refused.text) == (422, True), refused.text
+    assert tempfile.gettempdir() not in refused.text
 
 
 async def test_it_is_changed_removed_and_undone(both) -> None:
@@ -146,7 +191,6 @@ async def test_a_system_without_a_code_can_be_applied_again(both) -> None:
         ("EPSG:4326", {"how": "hand", "east": 9.0, "north": 48.0}, "degrees"),
         ("EPSG:1", {"how": "hand", "east": 9.0, "north": 48.0}, "not a coordinate reference system"),
         (UTM, {"how": "control"}, "no control points are too few"),
-        (UTM, {"how": "control", "table": "tree,easting\n1,2\n"}, "header"),
         (UTM, {"how": "control", "points": [{"tree": 1, "east": 5e5, "north": 53e5}]}, "too few"),
         (UTM, {"how": "control", "points": [{"east": 5e5, "north": 53e5}]}, "point 1 has no place"),
         (
@@ -169,15 +213,6 @@ async def test_a_system_without_a_code_can_be_applied_again(both) -> None:
                 "points": [{"x": 9.0 * k, "y": 0.0, "east": 5e5 + k * k, "north": 53e5} for k in range(4)],
             },
             "contradict",
-        ),
-        (
-            UTM,
-            {
-                "how": "control",
-                "table": "x_m,y_m,easting,northing\n"
-                + "".join(f"{k},0,{500000 + k},5300000\n" for k in range(201)),
-            },
-            "at most 200 control points",
         ),
         (UTM, {"how": "guess"}, "guess"),
     ],

@@ -109,6 +109,56 @@ def test_layers_have_their_fields_places_and_reference_system(runs, tmp_path, ca
             np.testing.assert_allclose(heights, low + np.array([0.5, 1.0, 1.5]), atol=1e-9)
 
 
+@pytest.mark.parametrize("suffix", ["gpkg", "shp"])
+def test_plots_have_the_numbers_of_trees_with_each_value(tmp_path, capsys, suffix):
+    run = grid_run(tmp_path / "run")
+    trees = run / "trees.csv"
+    header, *rows = (line.split(",") for line in trees.read_text().splitlines())
+    rows[0][header.index("dbh_cm")] = rows[0][header.index("sigma_dbh_cm")] = ""
+    for row in rows[:2]:
+        row[header.index("height_m")] = "20.00"
+    trees.write_text("\n".join(",".join(row) for row in (header, *rows)) + "\n")
+    names = ["trees", "trees_with_dbh", "trees_with_height", "trees_with_volume"]
+    if suffix == "shp":
+        names = ["trees", "trees_dbh", "trees_h", "trees_v"]
+    for words, volumes in (([], None), (["--volume", "0.001 * dbh_cm * height_m"], 1)):
+        file = tmp_path / f"{len(words)}.{suffix}"
+        told = stemmap(
+            capsys, "export", run, "--to", file, "--circle", "10,10,9", "--circle", "2,2,2", *words
+        )
+        assert told.code == 0, told.err
+        part, layer = (file, "plots") if suffix == "gpkg" else (tmp_path / f"{len(words)}_plots.shp", None)
+        with fiona.open(part, layer=layer) as table:
+            plot = list(table)[1].properties
+        assert [plot[name] for name in names] == [4, 3, 2, volumes]
+
+
+def test_what_people_measured_is_in_every_format(tmp_path, capsys):
+    run = grid_run(tmp_path / "run")
+    stemmap(capsys, "georeference", run, "--by-hand", "500000,5300000,0", "--crs", "EPSG:25832")
+    (run / "measured.csv").write_text(
+        "of_tree,x_m,y_m,dbh_tape_cm\n5,9.000,1.000,23.4\n,2.000,2.000,31.0\n,4,2,\n"
+    )
+    files = {suffix: tmp_path / f"trees.{suffix}" for suffix in ("gpkg", "shp", "xlsx", "dxf", "geojson")}
+    for file in files.values():
+        assert stemmap(capsys, "export", run, "--to", file).code == 0
+    for part, layer, name in (
+        (files["gpkg"], "added", "dbh_tape_cm"),
+        (tmp_path / "trees_added.shp", None, "dbh_tape"),
+    ):
+        with fiona.open(part, layer=layer) as table:
+            rows = [(row.geometry.coordinates[0], row.properties[name]) for row in table]
+        assert rows == [(pytest.approx(500002.0), 31.0), (pytest.approx(500004.0), None)]
+    with fiona.open(files["gpkg"], layer="trees") as table:
+        tape = {row.properties["tree"]: row.properties["dbh_tape_cm"] for row in table}
+    assert {number: dbh for number, dbh in tape.items() if dbh is not None} == {5: 23.4}
+    book = openpyxl.load_workbook(files["xlsx"])
+    assert list(book["added"].values)[:2] == [("east_m", "north_m", "dbh_tape_cm"), (500002, 5300002, 31)]
+    assert "ADDED" in files["dxf"].read_text()
+    assert len(json.loads(files["geojson"].read_text())["features"]) == 102
+    assert "100 trees" in stemmap(capsys, "stand", run).out, "the figures are those of the map"
+
+
 def test_qgis_finds_a_style_for_each_layer_and_the_file_is_sound(runs, tmp_path, capsys):
     file = exported(capsys, runs["utm"], tmp_path / "trees.gpkg")
     database = sqlite3.connect(file)
@@ -196,6 +246,7 @@ def test_the_workbook_names_fields_and_units_and_leaves_the_unknown_empty(runs, 
     for layer, layer_fields in LAYER_FIELDS.items():
         told = {row[0] for row in rows if row[3] == layer}
         assert {field.name for field in layer_fields} <= told, layer
+    assert "added" not in book.sheetnames
     assert set(next(book["plots"].values)) == {row[0] for row in rows if row[3] == "plots"}
     assert all(row[2] for row in rows)
     assert ("area_m2", "m2", "area of the plot", "plots") in rows

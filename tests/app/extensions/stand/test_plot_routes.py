@@ -6,6 +6,7 @@ import asyncio
 import base64
 import json
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -249,9 +250,22 @@ async def test_the_command_line_uses_the_plots_of_the_page(tmp_path, capsys, mon
         run = folder / "run.json"
         run.write_text(run.read_text().replace('"sha256": "00"', f'"sha256": "{dashboard.digest}"'))
         await act(client, "POST", plots=[{**CIRCLE, "shape": {**CIRCLE["shape"], "x": 10.0, "y": 10.0}}])
+        number = (await client.get("/api/annotations")).json()["run"]
+        names = {"stand": "Hohe Warte", "client": "the town", "author": "Ann"}
+        body = {"run": number, "browser": "a" * 16, "who": "Ann", "names": names}
+        assert (await client.put("/api/heading", json=body)).status_code == 200
     assert await asyncio.to_thread(main, ["stand", str(folder)]) == 0
     told = capsys.readouterr()
     assert "1 plot: 24 trees from 7 cm on 100 m2" in told.out
     assert "plots: 1 plot of the page" in told.err
     assert await asyncio.to_thread(main, ["stand", str(folder), "--plots", "none"]) == 0
     assert "whole observed area" in capsys.readouterr().out
+    report = tmp_path / "report.html"
+    words = ["report", str(folder), "--out", str(report), "--author", "Bo"]
+    assert await asyncio.to_thread(main, words) == 0
+    assert "heading of the page: Hohe Warte, the town\n" in capsys.readouterr().err
+    assert re.findall(r">(Hohe Warte|the town|Ann|Bo)<", report.read_text()) == [
+        "Hohe Warte",
+        "the town",
+        "Bo",
+    ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import math
 import os
@@ -186,11 +187,14 @@ def test_parameters_have_titles_and_units(tmp_path, capsys):
 
 def test_dates_pages_units_and_zeros(run, tmp_path, capsys):
     os.utime(run / "run.json", (1714732872, 1714732872))  # noon in Europe
-    text = page_of(capsys, run, tmp_path / "r.html")
-    assert "Mapped: 2024-05-03" in text
+    text = page_of(capsys, run, tmp_path / "r.html", ["--date", "2024-06-01"])
+    assert '<td>Mapped</td><td class="words">2024-05-03</td>' in text
+    assert '<td>Report</td><td class="words">2024-06-01</td>' in text
     assert "Recorded" not in text
     german = page_of(capsys, run, tmp_path / "g.html", ["--language", "de"])
-    assert "Kartierung: 03.05.2024" in german
+    assert '<td>Kartierung</td><td class="words">03.05.2024</td>' in german
+    today = datetime.date.today().strftime("%d.%m.%Y")
+    assert f'content: "Bestandesbericht, {today}"' in german
     assert 'content: "Seite " counter(page) " / " counter(pages)' in german
     for page in (text, german):
         assert "m²/ha" in page
@@ -204,8 +208,33 @@ def test_the_date_of_the_recording_is_that_of_its_first_scan(tmp_path, capsys):
     record = json.loads(file.read_text())
     for recorded, shown in ((recorded_time("pcap", 1714732872 * 10**9)["recorded"], True), ("soon", False)):
         file.write_text(json.dumps(record | {"recorded": recorded}))
-        assert ("Recorded: 2024-05-03" in page_of(capsys, folder, tmp_path / "r.html")) == shown
+        row = '<td>Recorded</td><td class="words">2024-05-03</td>'
+        assert (row in page_of(capsys, folder, tmp_path / "r.html")) == shown
     assert recorded_time("simulated run", 1714732872 * 10**9) == recorded_time("pcap", 5 * 10**9) == {}
+
+
+def test_the_heading_has_names_and_not_the_path_of_the_file(run, tmp_path, capsys):
+    uri = json.loads((run / "run.json").read_text())["source"]["uri"]
+    words = ["--stand", "Hohe  Warte <3b>", "--client", "Stadt & Forst", "--date", "2026-05-31"]
+    text = page_of(capsys, run, tmp_path / "r.html", [*words, "--language", "de"])
+    assert "<title>Bestandesbericht: Hohe Warte &lt;3b&gt;</title>" in text
+    rows = dict(re.findall(r'<tr><td>([^<]+)</td><td class="words">([^<]*)</td></tr>', text))
+    expected = {
+        "Bestand": "Hohe Warte &lt;3b&gt;",
+        "Auftraggeber": "Stadt &amp; Forst",
+        "Bericht": "31.05.2026",
+    }
+    assert expected.items() <= rows.items()
+    assert "Verfasser" not in text, "an empty name is not printed"
+    method = text.index("<h2>Verfahren")
+    assert uri not in text[:method]
+    assert uri in text[method:]
+    assert text.index("Ort, Datum") > text.index("<h2>Bäume")
+    assert "Unterschrift" in text
+    bare = page_of(capsys, run, tmp_path / "b.html")
+    assert "<title>Stand report</title>" in bare
+    assert not {"Stand", "Client", "Author"} & set(re.findall(r"<td>(\w+)</td>", bare))
+    assert "Signature" in bare
 
 
 def test_a_small_error_is_not_rounded_to_0_and_one_that_is_not_known_is_explained(run, tmp_path, capsys):
@@ -292,6 +321,7 @@ def test_numbers_are_those_of_the_language():
         (["--out", "r.txt"], 1, ".html or .pdf"),
         (["--out", "r.html", "--language", "fr"], 1, "Languages: en, de"),
         (["--out", "missing/r.html"], 1, "no such folder"),
+        (["--out", "r.html", "--date", "tomorrow"], 2, "'tomorrow' is not a date"),
     ],
 )
 def test_what_cannot_be_written_is_refused(run, tmp_path, capsys, monkeypatch, words, code, message):

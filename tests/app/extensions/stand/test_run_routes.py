@@ -11,6 +11,7 @@ import pytest
 from app.cli import main
 from app.common.settings import Settings
 from app.dashboard.shown_run import ShownRun
+from app.extensions.stand.heading import Heading
 from app.extensions.stand.plot_files import plots_of_run
 from app.extensions.stand.report import report_page
 from app.worker.protocol import View
@@ -113,10 +114,26 @@ async def test_the_report_of_a_run_is_that_of_the_command_line(both: Running, tm
     assert "Bestandesbericht" in page
     assert "north" in page
     assert "Stammvolumen je Hektar" in page
+    names = {"stand": "Hohe Warte", "client": "", "author": " Ann  Lee "}
+    body = {"run": run, "browser": "a" * 16, "who": "Ann"}
+    edits = []
+    for words in ({"stand": "before"}, {}, {}):  # a repeated one is no edit
+        stored = await client.put("/api/heading", json={**body, "names": {**names, **words}})
+        assert stored.status_code == 200, stored.text
+        edits.append(stored.json()["undo"]["other"])
+    assert edits == [2, 3, 3]
+    (kept,) = (await client.get("/api/annotations")).json()["others"]["heading"]
+    assert (kept["stand"], kept["author"]) == ("Hohe Warte", "Ann Lee")
+    for wrong in ("a\x07", "a" * 101):
+        refused = await client.put("/api/heading", json={**body, "names": {**names, "stand": wrong}})
+        assert refused.status_code == 422
+
     english = (await client.get("/api/runs/open/report/html")).text
+    assert "Ann Lee" in english
     assert "What was left out" not in english  # only `stemmap map` counts it
     with ShownRun.of(dashboard).folder() as folder:
-        assert english == report_page(folder, plots=plots_of_run(ShownRun.of(dashboard)))
+        heading = Heading("Hohe Warte", "", "Ann Lee")
+        assert english == report_page(folder, plots=plots_of_run(ShownRun.of(dashboard)), heading=heading)
 
     key = next(row["key"] for row in await runs(client))
     assert (await client.get(f"/api/runs/{key}/report/html")).text == english

@@ -1,0 +1,27 @@
+// The names in the heading of the report, which are stored with the recording.
+
+import { edit, send } from "../../annotate/annotations.js";
+import { el } from "../../core/dom.js";
+import { state } from "../../core/store.js";
+
+const NAMES = { stand: "Name of the stand", client: "Who ordered the report", author: "Who made the report" };
+let saving = null; // the last edit
+
+const fields = Object.entries(NAMES).map(([name, title]) => el("input", { type: "text", name, title, maxlength: "100", autocomplete: "off", onchange: () => {
+  const names = Object.fromEntries(fields.map((field) => [field.name, field.value.trim()]));
+  saving = edit(() => send("PUT", "/api/heading", { names }));
+} }));
+
+export const headingFields = () => el("div", { id: "report-heading", class: "plot-form", "data-edits": true }, el("span", { text: "Heading of the report:" }), ...fields.map((field) => el("label", {}, field.name, field)));
+
+// A report that is asked for has the names that were typed before.
+export const headingSaved = () => saving;
+
+export function fillHeading() {
+  const stored = state.annotations?.others.heading?.at(-1) ?? {};
+  for (const field of fields) {
+    const value = stored[field.name] ?? "", typing = field === document.activeElement && field.value !== field.defaultValue;
+    field.defaultValue = value;
+    if (!typing) field.value = value;
+  }
+}
