@@ -29,6 +29,7 @@ COMMANDS = (
     "recover",
     "info",
     "simulate",
+    "send",
     "evaluate",
     "export",
     "params",

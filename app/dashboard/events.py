@@ -14,6 +14,7 @@ from pipeline.types.records import Float, Frame, Zone
 
 Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "silence"]
 
+_LASTING = ("health", "stop", "silence")
 _OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
 #: Count at the end of a warning, such as "scans lost on the network (3)".
@@ -30,7 +31,7 @@ class Event:
         kind: Tree mapped, warning, parameters changed, pose quality changed, annotation, obstacle in the stop
             zone, or robot without data.
         text: Description for people.
-        lasts: Whether it lasts until the next event of its kind.
+        lasts: Whether it lasts until the next event of its kind, or until the robot sends no data.
     """
 
     time_s: float
@@ -102,13 +103,18 @@ class Events:
 
     def silent(self, why: str, time_s: float) -> bool:
         """Add an event for a robot that sends no data, unless it has one; it ends with the next shown scan.
-        Return whether it was added.
+        Return whether it was added. What lasts until then ends, since nothing is known of the time of a
+        silence; if it is still there in the next shown scan, it begins again.
 
         Args:
             why: The reason.
             time_s: Time of the last scan [s since the first scan].
         """
-        return self._turn("silence", True, time_s, why[:_LONGEST])
+        if not self._turn("silence", True, time_s, why[:_LONGEST]):
+            return False
+        self._lasting -= {"stop"}
+        self._health = "good" if self._health == "good" else "unknown"
+        return True
 
     def remapped(self, confirmed: list[tuple[int, float]], time_s: float, *, live: bool = False) -> None:
         """Replace the events of trees by those of `confirmed`, and remove those of the pose quality, after
@@ -194,7 +200,8 @@ class Events:
             if event.lasts:
                 end_s = ends.get(event.kind)
                 each["for_s"] = None if end_s is None else round(end_s - event.time_s, 2)
-            ends[event.kind] = event.time_s
+            is_silence = event.kind == "silence" and event.lasts
+            ends |= dict.fromkeys(_LASTING if is_silence else (event.kind,), event.time_s)
             plain.append({**each, "before": True} if old else each)
         return {"events": plain[::-1]}
 
@@ -235,4 +242,4 @@ class Events:
 def _goes(kind: Kind) -> int:
     """Return the place of a kind in the order in which events are removed: what an operator is asked for
     afterwards goes last."""
-    return 0 if kind == "tree" else 2 if kind in ("stop", "silence", "health") else 1
+    return 0 if kind == "tree" else 2 if kind in _LASTING else 1

@@ -260,7 +260,7 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
 def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None) -> RunFigures:
     """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
     (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth), in the
-    coordinates of the files, which are those of the map plus `offset`.
+    coordinates of the files, which are those of the map plus `offset`; and `recordings`, see `ShownRun`.
 
     Args:
         state, scores: The state, and its scores; None if there are none.
@@ -284,6 +284,7 @@ def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int |
             "path": thinned(np.column_stack([state.path.x, state.path.y]) + state.offset[:2]),
             "truth": None if truth is None else truth["trees"],
             "offset": list(state.offset[:2]),
+            "recordings": list(state.recordings),
         },
     )
 

@@ -64,6 +64,7 @@ class ShownRun:
         edits: The annotations, also those of skipped trees and of extensions.
         frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
             none.
+        recordings: Absolute paths of the files to which a live run was recorded.
     """
 
     request: SourceRequest
@@ -78,6 +79,7 @@ class ShownRun:
     seen: SeenRecorder
     edits: tuple[Annotation, ...]
     frame: Annotation | None
+    recordings: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, dashboard: Dashboard) -> ShownRun:
@@ -98,6 +100,7 @@ class ShownRun:
             dashboard.seen,
             (*editor.rows, *editor.skipped, *editor.others),
             editor.frame,
+            tuple(dashboard.run_recordings),
         )
 
     @property
@@ -204,11 +207,11 @@ class ShownRun:
         """Return the content of run.json as a dict.
 
         The keys are `stemmap` (version); `source`, a dict with `uri`, `kind`, `sha256` ("" if the recording
-        has no digest) and, for a source of one step, those of `OneStep`; `recorded` and `chosen`
-        where known; `seed`, `odometry`, `preset`, `changed` and `parameters`; `scans` (0 without a drive),
-        `duration_s` and `distance_m`; `trees`, without the rejected ones, and `rejected`, their number;
-        `evaluation`, which reviews do not change, None without ground truth; `repairs`, see `repairs_record`,
-        if there are any; and those of `_counts`."""
+        has no digest) and, for a source of one step, those of `OneStep`; `recorded` and `chosen` where known;
+        `recordings` of a live run, if there are any; `seed`, `odometry`, `preset`, `changed` and
+        `parameters`; `scans` (0 without a drive), `duration_s` and `distance_m`; `trees`, without the
+        rejected ones, and `rejected`, their number; `evaluation`, which reviews do not change, None without
+        ground truth; `repairs`, see `repairs_record`, if there are any; and those of `_counts`."""
         status, truth = self.status, truth_in_file(self.truth, self.one_step)
         trees = in_file(self.shown.frame.trees, self.one_step)
         rejected = sum(review == REJECTED for review in self.reviews().values())
@@ -229,6 +232,7 @@ class ShownRun:
             "stemmap": version(),
             "source": source,
             **({} if self.one_step else recorded_time(status.kind, self.start_ns)),
+            **({"recordings": list(self.recordings)} if self.recordings else {}),
             "seed": self.request.seed,
             "odometry": self.request.odometry,
             **({} if (chosen := self.request.kept_choices()) is None else {"chosen": chosen}),

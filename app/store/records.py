@@ -153,7 +153,7 @@ class RunFigures:
         preset: Name of the preset.
         parameters: Dict from the dotted name of each parameter to its value.
         scores: Result of `score_payload`, or None.
-        map: Dict with `trees`, `path` and `truth`, lists of JSON values.
+        map: Dict with `trees`, `path`, `truth` and, of a live run, `recordings`, lists of JSON values.
     """
 
     scans: int

@@ -9,6 +9,7 @@ simulator.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import sys
 import time
@@ -70,10 +71,10 @@ def is_compiled() -> bool:
     """Return whether the kernels of both programs are cached for the current sources, by the kernel that each
     program compiles last."""
     from pipeline.jit import is_kept
+    from pipeline.loop_closure.stem_matching import partners
     from pipeline.remapping.preview import grouped
-    from pipeline.tracking.track_classification import classify_new
 
-    return is_kept(grouped) and is_kept(classify_new)
+    return is_kept(grouped) and is_kept(partners)
 
 
 def is_front_end_compiled() -> bool:
@@ -156,14 +157,17 @@ def warm_up() -> None:
 
 def compile_scans() -> None:
     """Compile the kernels of the front end, of the columns and of the terrain, which need no SLAM, in the
-    order in which a scan needs them; then those that only whole scans need, see `map_scans`. Before these, it
+    order in which a scan needs them, and those of other presets; then those that only whole scans need, see
+    `map_scans`. Before these, it
     waits up to _OTHER_S for the other program, which would otherwise compile the same kernels."""
     from pipeline.classification import ColumnClassifier, ScanView
+    from pipeline.config import preset
+    from pipeline.front_end import detect
     from pipeline.ground.terrain_map import HeightMapper
     from pipeline.jit import is_kept
     from pipeline.tracking.track_classification import classify_new
 
-    mapper, terrain = _mapper(), HeightMapper()
+    mapper, terrain = _mapper(Parameters()), HeightMapper()
     columns = ColumnClassifier(mapper.parameters.classification, all_around=True, forests=kept_forests())
     for step in _scans():
         scan = mapper.segment(step)
@@ -175,6 +179,9 @@ def compile_scans() -> None:
             columns.settle()
         if scan.terrain is not None:
             terrain.add(scan.terrain, pose, scan.sensor_offset)
+    for name in ("paper", "laser2d"):  # which find clusters in another way
+        mapper = _mapper(preset(name))
+        detect(mapper.segment(next(_scans())), mapper.parameters.detection)
     until_s = time.monotonic() + _OTHER_S
     while not is_kept(classify_new) and time.monotonic() < until_s:
         time.sleep(_POLL_S)
@@ -186,7 +193,7 @@ def map_scans() -> None:
     preview."""
     from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees
 
-    mapper, clusters, columns = _mapper(), ClusterTable(), None
+    mapper, clusters, columns = _mapper(Parameters()), ClusterTable(), None
     for step in _scans():
         frame = mapper.process(step)
         clusters.record(frame)
@@ -195,14 +202,14 @@ def map_scans() -> None:
     preview_trees(KnownMap(mapper.parameters, clusters, mapper.path, columns), mapper.parameters)
 
 
-def _mapper() -> Mapper:
-    """Return a mapper of the scans of `_scans`."""
+def _mapper(parameters: Parameters) -> Mapper:
+    """Return a mapper of the scans of `_scans`, whose voxel map is so small that it becomes full."""
     from pipeline.mapper import Mapper
     from pipeline.types.records import Sensor
 
     azimuth_step = 2.0 * np.pi / _SHOTS
     return Mapper(
-        Parameters(),
+        parameters.replace({"classification.voxels_log2": 12}),
         sensor=Sensor("VLP-16", _RINGS, float(np.radians(2.0)), azimuth_step, range_sigma=_NOISE),
         T_base_lidar=Pose3.from_euler(np.array([0.0, 0.0, _SENSOR_Z]), 0.0, 0.0, 0.0),
         seed=0,
@@ -256,7 +263,7 @@ def _returns(along: float) -> Float32:
 
 def map_stems() -> None:
     """Compile the kernels of SLAM, of the Kalman filters of the trees and of the preview, by mapping
-    simulated stems."""
+    simulated stems; then those that only troubles need, for which the other program does not wait."""
     from pipeline.classification import no_columns
     from pipeline.config import preset
     from pipeline.mapper import Mapper
@@ -267,29 +274,42 @@ def map_stems() -> None:
 
     # All scans resample, which usual ones do late in a run.
     stems, clusters = preset("stems").replace({"slam.resample_below": 1.0}), ClusterTable()
-    mapper = Mapper(stems, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
-    for step in _stems():
+    mapper, steps = Mapper(stems, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0), _stems()
+    for step in itertools.islice(steps, 1 + len(_REVISIT)):
         clusters.record(mapper.process(step))
     known = KnownMap(stems, clusters, mapper.path, None)
     preview_trees(known, stems.replace({"tracking.hits_to_confirm": 4}))
     tracker = Tracker(stems.tracking)
     tree_columns(tracker.classify(0, no_columns(), stems.classification))
     tracker.classify_new(no_columns())
+    for step in steps:
+        mapper.process(step)
+
+
+_AHEAD, _AWAY = Pose2(0.5), Pose2(50.0)
+# Motions of the robot between two scans. It passes trees, is far from them for a scan, and comes back.
+_REVISIT = [*[_AHEAD] * 12, _AWAY, _AWAY.inverse(), _AHEAD]
+# Motions that the odometry reports as `_AHEAD`: the robot is moved by less than the distance between trees,
+# by more, and to another part of the map, where it is lost and then found.
+_TROUBLES = [Pose2(0.9), *[_AHEAD] * 8, Pose2(2.0, 0.3, 0.1), *[_AHEAD] * 8]
+_TROUBLES += [Pose2(-6.0, 2.0, 2.0), *[_AHEAD] * 8]
 
 
 def _stems() -> Iterator[Step]:
-    """Yield twelve steps, 0.1 s apart, of a robot that drives 0.5 m per scan along x, between trees in a grid
-    with spacings of 3 m in x and 2.5 to 3 m in y; then one without trees, so far away that the trees are
-    those of another place, and two between the trees again."""
+    """Yield the steps of `_REVISIT`, then those of `_TROUBLES`, 0.1 s apart."""
     from pipeline.types.records import Scan, Stems, Step
 
-    x, y = np.meshgrid(np.arange(-6.0, 12.0, 3.0), np.array([-4.0, -1.5, 1.5, 4.0]))
-    for index, along in enumerate([*np.arange(0.0, 6.0, 0.5), 50.0, 0.0, 0.5]):
-        places = np.column_stack([x.ravel() - along, y.ravel(), np.zeros(x.size)]).astype(np.float32)
-        places = places[: 0 if along > 6.0 else x.size]
-        upright = np.tile([0.0, 0.0, 1.0], (len(places), 1))
-        scan = Scan(100_000_000 * index, places, stems=Stems(upright, np.full(len(places), 0.3)))
-        yield Step(index, scan, Pose2(along, 0.0, 0.0))
+    trees = np.random.default_rng(0).uniform([-10.0, -12.0], [30.0, 12.0], (80, 2))
+    truth = odometry = Pose2()
+    motions = [(each, each) for each in _REVISIT] + [(each, _AHEAD) for each in _TROUBLES]
+    for index, (moved, reported) in enumerate([(Pose2(), Pose2()), *motions]):
+        truth, odometry = truth @ moved, odometry @ reported
+        places = truth.inverse().apply(trees)
+        places = places[np.hypot(*places.T) < 9.0]
+        points = np.column_stack([places, np.zeros(len(places))]).astype(np.float32)
+        upright = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+        scan = Scan(100_000_000 * index, points, stems=Stems(upright, np.full(len(points), 0.3)))
+        yield Step(index, scan, odometry)
 
 
 def simulate() -> None:

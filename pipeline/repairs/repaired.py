@@ -264,11 +264,11 @@ def _with_separated(trees: Trees, stems: Sequence[tuple[int, Float, Int]], stamp
 
 def _moved_frame(frame: Frame, trees: Trees, correction: PathCorrection) -> Frame:
     """Return the results with a corrected path: the pose with its particles, the columns and the terrain;
-    `trees` are corrected already. A doubt about the pose is said to be of the map before the repairs, since
-    its quality is not determined again."""
-    estimate, health = frame.estimate, frame.health
-    if health.reason:
-        estimate = replace(estimate, health=replace(health, reason=f"before the repairs: {health.reason}"))
+    `trees` are corrected already. The reason of the quality of the pose, also of a good one, says that it is
+    of the map before the repairs: it follows from what the scans found in that map."""
+    health = frame.health
+    reason = f"before the repairs: {health.reason}" if health.reason else "before the repairs"
+    estimate = replace(frame.estimate, health=replace(health, reason=reason))
     before, after = correction.before[-1], correction.after[-1]
     turn = float(wrap_angle(after[2] - before[2]))
     move = Pose2(*after.tolist()) @ Pose2(*before.tolist()).inverse()

@@ -550,7 +550,7 @@ class Health:
 
     Attributes:
         state: "good"; "weak": the map may be wrong; "lost": the pose is not usable.
-        reason: Message with the reason; empty if good.
+        reason: Message with the reason; empty if good, unless the map was repaired since.
         n_eff: Effective number of particles.
         ancestors: Number of particles of 50 to 100 scans ago that have descendants.
         detections: Number of detections in the scan.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -77,12 +78,17 @@ def test_runs_are_stored_renamed_deleted_and_replayed(own: Dashboard, tmp_path: 
     expect(page.locator("#run-detail .empty")).to_contain_text("run.json is damaged")
 
     def as_live(route: Route) -> None:
-        route.fulfill(json={**route.fetch().json(), "live": True})
+        run = route.fetch().json()
+        run["map"]["recordings"] = ["/data/north.mcap", "/data/south.mcap"]
+        route.fulfill(json={**run, "live": True})
 
     page.route("**/api/runs/*", as_live)
     rows.nth(1).get_by_role("button").click()
     expect(page.get_by_role("button", name="Rename")).to_be_visible()
     expect(page.get_by_role("button", name="Replay")).to_be_hidden()  # nothing can be replayed
+    expect(page.locator("#run-recordings")).to_have_text("Recorded tonorth.mcapsouth.mcap")
+    south = page.get_by_role("button", name="south.mcap")
+    expect(south).to_have_attribute("title", re.compile("^/data/south.mcap\n"))
     page.unroute("**/api/runs/*")
     rows.nth(1).get_by_role("button").click()
     page.get_by_role("button", name="Replay").click()

@@ -1,6 +1,6 @@
 // One run: figures, map, parameters and their changes.
 
-import { get } from "../core/api.js";
+import { get, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
 import { clock, count, figure, NONE } from "../core/format.js";
@@ -68,7 +68,15 @@ function head(run, { replay, rename, remove }) {
     ...(own ? [
       el("button", { id: "run-rename", "data-edit": true, text: "Rename", onclick: () => edit(title, run, guarded, rename) }),
       el("button", { id: "run-delete", "data-edit": true, text: "Delete", title: "Delete this run; it can be restored", onclick: guarded(() => remove(run)) })] : []),
-    el("p", { class: "dim", text: `${run.uri} · ${run.kind}${run.begun_s ? ` · ${when(run.begun_s)}` : ""}` }), error);
+    el("p", { class: "dim", text: `${run.uri} · ${run.kind}${run.begun_s ? ` · ${when(run.begun_s)}` : ""}` }),
+    recordings(run, guarded), error);
+}
+
+// The files of a live run; a press opens one in the dashboard.
+function recordings({ live, map: { recordings: files } }, guarded) {
+  const show = (uri) => guarded(async () => { await open({ uri }); location.href = "/"; });
+  return el("p", { class: "dim row", id: "run-recordings", hidden: !live || !files, text: files?.length ? "Recorded to" : "Not recorded" }, ...(files ?? []).map((file) =>
+    el("button", { class: "small", "data-edit": true, text: file.split(/[/\\]/).pop(), title: `${file}\nOpen this recording in the dashboard`, onclick: show(file) })));
 }
 
 function edit(title, run, guarded, rename) {

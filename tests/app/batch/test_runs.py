@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import io
+import json
 import re
+import zipfile
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock
@@ -24,13 +28,14 @@ from app.sources.request import SourceRequest, request_of_kept
 from app.store.database import maps
 from app.store.records import Author, Content
 from app.store.store import Store
-from app.worker.protocol import Begin, Open, Shown
+from app.worker.protocol import Begin, Open, Report, Shown, Status
 from pipeline.errors import SourceError, StemmapError
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
 
 TRUTH = truth_trees()
+LIVE = "zenoh:tcp/127.0.0.1:7447"
 NAMED = {"Cookie": "stemmap_name=Ann%20B"}
 
 
@@ -110,6 +115,26 @@ async def test_what_the_database_refused_is_written_when_it_answers_again(
     async with asyncio.timeout(20):
         while (await runs(client))[0]["scans"] != 5:
             await asyncio.sleep(0.01)
+
+
+async def test_a_live_run_names_its_recordings(both: Running, tmp_path: Path) -> None:
+    client, dashboard = both
+    live = Status("playing", scan_index=2, live=True)
+    await play(dashboard, LIVE, scan=1)
+    for name in ("first.mcap", "first.mcap", "second.mcap"):
+        await dashboard.receive(Report(replace(live, recorded_file=str(tmp_path / name))))
+    await show(dashboard, 2, 4)
+    await dashboard.receive(Report(replace(live, state="finished", recorded_file=str(tmp_path / name))))
+    await play(dashboard, f"{LIVE}2", run=2)
+    await dashboard.run_recorder.close()
+    names = [str(tmp_path / "first.mcap"), str(tmp_path / "second.mcap")]
+    named = {}
+    for row in await runs(client):
+        named[row["uri"]] = (await client.get(f"/api/runs/{row['key']}")).json()["map"]["recordings"]
+    assert named == {LIVE: names, f"{LIVE}2": []}
+    files = await dashboard.store.ask(lambda store: store.book.files(1))
+    with zipfile.ZipFile(io.BytesIO(files)) as archive:
+        assert json.loads(archive.read("run.json"))["recordings"] == names
 
 
 async def test_a_run_that_showed_nothing_leaves_no_record(both: Running) -> None:

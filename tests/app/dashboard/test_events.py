@@ -72,6 +72,26 @@ def test_stops_silences_and_doubts_are_logged_with_their_durations():
     assert events.silent("gone again", 15.5)
 
 
+def test_stops_and_doubts_end_at_a_silence_and_begin_again_after_it():
+    events, lost = Events(), Health(state="lost", reason="no trees")
+    stopped = replace(seen(0, 0, lost), clearance=Clearance(Zone.STOP, ahead=0.8))
+    events.shown(stopped, 1.0)
+    events.silent("Nothing heard for 2 s: the robot is gone", 3.0)
+    assert lasting(events) == [(1.0, "health", 2.0), (1.0, "stop", 2.0), (3.0, "silence", None)]
+    events.shown(replace(stopped, index=1), 60.0)
+    events.shown(seen(2, 0), 64.0)
+    assert lasting(events) == [
+        (1.0, "health", 2.0),
+        (1.0, "stop", 2.0),
+        (3.0, "silence", 57.0),
+        (60.0, "health", 4.0),
+        (60.0, "stop", 4.0),
+    ]
+    events.silent("gone", 65.0)
+    events.shown(seen(3, 0), 70.0)
+    assert len(lasting(events)) == 6
+
+
 def test_a_log_of_a_live_run_outlasts_many_trees_and_a_rerun():
     events = Events()
     events.shown(seen(0, 0, Health(state="lost", reason="no trees")), 0.0)

@@ -21,9 +21,13 @@ from numba.core.dispatcher import Dispatcher
 from app.worker.numba_warmup import compile_scans, compiled_kernels, is_compiled, map_stems, warm_up
 from app.worker.process import new_session
 from app.worker.protocol import Open
-from pipeline.config import Parameters
+from pipeline.config import PRESETS, Parameters, preset
+from pipeline.geometry.poses import Pose3
+from pipeline.mapper import Mapper
+from pipeline.odometry.synchroniser import steps
 from pipeline.slam.particle_maps import take_ancestors
 from pipeline.tracking.track_classification import classify_new
+from tests.benchmarks.troubled import PLACES, SENSOR, TROUBLES, drive, parameters as parameters_of_stems
 
 
 def seen():
@@ -57,12 +61,25 @@ for revision, change in enumerate([{"classification.tree_share": 0.7}, {"detecti
     while session.is_remapping:
         session.remap()
 session.close()
+small = {"classification.voxels_log2": 12}  # the map of voxels is full soon
+for parameters in [Parameters().replace(small), *map(preset, PRESETS)]:
+    session.open(Open("sim:stand?duration=1", "auto", 0))
+    session.set_parameters(parameters, 0)
+    session.advance(10)
+    while session.pace == "hurry":
+        session.work()
+session.close()
+for place, trouble in [("stand", "gap, pushed"), ("a circle", "gap, odometry restarts"), ("stand", "stuck")]:
+    mapper = Mapper(parameters_of_stems(), sensor=SENSOR, T_base_lidar=Pose3.identity(), seed=0)
+    states = [mapper.process(step).estimate.health.state
+              for step in steps(drive(PLACES[place], 0, TROUBLES[trouble]).records)]
+    assert states.count("good") < len(states), trouble
 late = {kernel for kernel in seen() - before if not kernel[0].startswith("pipeline.simulation.")}
 print(*sorted(late), sep="\\n", end="")
 """
 
 
-def test_the_halves_compile_what_the_mapper_and_a_slider_call():
+def test_the_halves_compile_what_drives_with_troubles_and_a_slider_call():
     run = [sys.executable, "-c", PROGRAM]
     told = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
     assert not told.stdout

@@ -14,7 +14,7 @@ from pipeline.geometry.poses import Pose2
 from pipeline.repairs.record import Kind, Repair, parse_repairs, repairs_text, seen_from
 from pipeline.repairs.repaired import MapOfRun, RepairedMap, Repairer, _joined
 from pipeline.repairs.trees import numbers_of, repaired_trees
-from pipeline.types.records import Float
+from pipeline.types.records import Float, Health
 from tests.benchmarks.broken_ring import DOUBLE, GHOSTS, POLES, TWIN, FaultyRing
 from tests.benchmarks.wide_ring import NS, mapped
 from tests.pipeline import strategies
@@ -115,7 +115,7 @@ def test_ten_repairs_mend_a_broken_ring(seed):
     assert np.count_nonzero(apart.min(axis=1) < 1.0) <= 4, "only the twins and their neighbours"
 
 
-def test_a_doubt_about_the_pose_is_said_to_be_of_the_map_before_the_tie():
+def test_the_quality_of_the_pose_is_said_to_be_of_the_map_before_the_tie():
     of, person = run(1)[0], repaired(1)
     assert of.frame.health.reason.startswith("the position is uncertain by")
     tie, *others = person.repairs
@@ -123,6 +123,9 @@ def test_a_doubt_about_the_pose_is_said_to_be_of_the_map_before_the_tie():
     assert tied.state == of.frame.health.state
     assert tied.reason == f"before the repairs: {of.frame.health.reason}"
     assert Repairer().repaired(of, others[:2]).frame.health == of.frame.health
+    estimate = replace(of.frame.estimate, health=Health(), covariance=1e-4 * np.eye(3))
+    good = Repairer().repaired(replace(of, frame=replace(of.frame, estimate=estimate)), [tie]).frame.health
+    assert good == Health(reason="before the repairs")
 
 
 @pytest.mark.parametrize("seed", [0, 1])

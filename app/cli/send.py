@@ -1,0 +1,44 @@
+"""`stemmap send RUN`: sends a recording or a simulated run over Zenoh, to practise a live run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from app.cli.flags import compilation_notice
+
+HELP = "send a recording or a simulated run as a robot does, to practise a live run"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument(
+        "source",
+        metavar="RUN",
+        help="an MCAP recording of ROS 2 topics, or a simulated run such as sim:stand?duration=60",
+    )
+    parser.add_argument(
+        "--port", type=int, default=7447, metavar="N", help="port of this machine (default: 7447)"
+    )
+
+
+@compilation_notice()
+def run(arguments: argparse.Namespace) -> int:
+    """Send the run once, as soon as somebody listens; return 0.
+
+    Raises:
+        StemmapError: The run cannot be read, or the port cannot be used.
+    """
+    from app.robot.practice_robot import send
+    from app.sources.opening import open_source
+    from pipeline.io.recording.mcap_writer import write_recording
+
+    with TemporaryDirectory(prefix="stemmap-send-") as folder:
+        file = Path(arguments.source)
+        if arguments.source.startswith("sim:"):
+            source, file = open_source(arguments.source), Path(folder) / "run.mcap"
+            known = source.description
+            write_recording(file, source.records(), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
+        print(f"{send(file, arguments.port)} scans were sent")
+    return 0

@@ -1,0 +1,71 @@
+"""A robot for practice: a Zenoh router on this machine that sends a recording at its own pace."""
+
+from __future__ import annotations
+
+import json
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from app.robot.topics import SCAN_TYPES
+from app.robot.zenoh import ADMIN, PUBLISHER, data_key
+from pipeline.errors import StemmapError
+from pipeline.io.readers.mcap_file import McapFile
+
+_HASH = "RIHS01_0"  # of the message types; stemmap does not compare it
+_POLL_S = 0.1
+_OTHERS_S = 0.5  # until the other topics are subscribed to as well
+
+
+def send(file: Path, port: int) -> int:
+    """Wait until somebody subscribes to the scans, then send all messages but those of stemmap at the pace of
+    the recording, and return the number of scans. What it waits for is printed.
+
+    Args:
+        file: Recording of ROS 2 topics as MCAP.
+        port: Port of this machine on which it listens.
+
+    Raises:
+        SourceError: The recording cannot be read.
+        StemmapError: The port cannot be used.
+    """
+    import zenoh
+
+    settings = {
+        "mode": "router",
+        "listen": {"endpoints": [f"tcp/127.0.0.1:{port}"]},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+    }
+    with closing(McapFile(file)) as container:
+        channels = {c.number: c for c in container.channels if "/stemmap/" not in c.topic}
+        try:
+            session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+        except zenoh.ZError as error:
+            raise StemmapError(
+                f"port {port} cannot be used: {error}", remedy="Choose another one with --port"
+            ) from None
+        with session:
+            tokens = []
+            publishers: dict[int, Any] = {}  # zenoh declares the type of `matching_status` wrongly
+            for number, channel in channels.items():
+                key = data_key(0, channel.topic, channel.msgtype, _HASH)
+                node = f"{ADMIN}/0/{session.info.zid()}/0/{number}/{PUBLISHER}/%/%/driver"
+                topic = f"{channel.topic.replace('/', '%')}/{key.split('/')[-2]}/{_HASH}/::,10:,:,:,,"
+                tokens.append(session.liveliness().declare_token(f"{node}/{topic}"))
+                publishers[number] = session.declare_publisher(
+                    key, congestion_control=zenoh.CongestionControl.BLOCK
+                )
+            scans = {number for number, channel in channels.items() if channel.msgtype in SCAN_TYPES}
+            address = f"zenoh:tcp/127.0.0.1:{port}"
+            print(f"The robot waits. Open it with: uv run stemmap {address}", flush=True)  # noqa: T201
+            while not any(publishers[number].matching_status.matching for number in scans):
+                time.sleep(_POLL_S)
+            time.sleep(_OTHERS_S)
+            begun, first_ns, sent = time.monotonic(), None, 0
+            for message in container.messages(list(channels), None, {}):
+                first_ns = message.log_ns if first_ns is None else first_ns
+                time.sleep(max(0.0, begun + 1e-9 * (message.log_ns - first_ns) - time.monotonic()))
+                publishers[message.channel].put(message.payload)
+                sent += message.channel in scans
+            return sent
