@@ -88,9 +88,6 @@ def run_start(
                 start.found = got.driven
             shift, is_at = offset[frame - begin], got.T_map_odom @ pose
             there = reference.there(truth[frame] + np.nan_to_num(shift))
-            if there is None:
-                start.wrong = start.wrong or not reference.covers(truth[frame : frame + 1, :2], 40.0)
-                continue
             off = there.inverse() @ is_at
             distance = math.hypot(off.x, off.y)
             start.wrong = start.wrong or distance > WRONG_XY or abs(off.yaw) > WRONG_YAW
@@ -121,9 +118,9 @@ def frames_found(drive: Drive, reference: Reference) -> tuple[int, int]:
     index = reference.index
     found = of = 0
     for k, truth in enumerate(drive.truth):
-        there = reference.there(truth)
-        if there is None or not reference.covers(truth[None, :2], REVISIT):
+        if not reference.covers(truth[None, :2], REVISIT):
             continue
+        there = reference.there(truth)
         of += 1
         here = drive.seen(k, SEEN) - truth[:2]
         unknown = np.full(len(here), np.nan)
