@@ -282,34 +282,19 @@ def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | No
 
 def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> DetectionFunction:
     """Return the probability of detection over distance, fitted to all trees in cells of known distance, of
-    at least the minimum diameter or without one, and to the cells among these trees. It is 1 if the parameter
-    `correction` is "none", if no distance is known, or if there are fewer than LEAST_TREES such trees."""
+    at least the minimum diameter or without one. It is 1 if the parameter `correction` is "none", if no
+    distance is known, or if there are fewer than LEAST_TREES such trees.
+
+    The cells are not limited to the hull of the trees: trees that are missed far from the path shrink it, so
+    that the decrease would vanish from the fit.
+    """
     if parameters.correction == "none":
         return _assumed("correction")
     known = seen.where(np.isfinite(seen.nearest))
     if not len(known.nearest):
         return _assumed("whole_cloud")
-    position = trees.position[~(trees.dbh < parameters.dbh_min)]
-    position = position[known.rows(position) >= 0]
-    if len(position) < LEAST_TREES:
-        return _assumed("few_trees")
-    known = _among(position, known)
-    rows = known.rows(position)
+    rows = known.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
     return fit_half_normal(known.nearest[rows[rows >= 0]], known.nearest) or _assumed("few_trees")
-
-
-def _among(position: Float, seen: SeenArea) -> SeenArea:
-    """Return the cells in the stand of some trees: a road or a field beyond it would look like missed trees.
-
-    The stand is estimated by the convex hull of the trees, enlarged about its centroid by n / (n - v) in area
-    for n trees, of which v are its corners (Ripley and Rasson 1977, Finding the edge of a Poisson forest).
-    """
-    hull, n = shapely.MultiPoint(position).convex_hull, len(position)
-    corners = len(shapely.get_coordinates(hull)) - 1  # the first one is also the last one
-    larger = math.sqrt(n / max(n - corners, 1))
-    centre = shapely.get_coordinates(hull.centroid)[0]
-    stand = shapely.transform(hull, lambda corner: centre + larger * (corner - centre))
-    return seen.where(shapely.contains_xy(stand, *seen.centres.T))
 
 
 def _assumed(reason: str) -> DetectionFunction:

@@ -215,15 +215,18 @@ def test_cells_of_unknown_distance_do_not_change_the_detection():
     assert figures["all"].values["n_ha"].value == pytest.approx(len(position) / 0.06)
 
 
-def test_a_field_beside_the_stand_is_no_stand_of_missed_trees():
-    """All trees of a stand 16 m wide are found from a path in its middle, which sees 15 m to each side."""
+@pytest.mark.parametrize("sigma", [3.0, 5.0])
+def test_trees_that_are_missed_far_from_the_path_give_the_decrease(sigma: float):
     seen = area_of([[x, y] for x in range(120) for y in range(-30, 30)])
     seen = replace(seen, nearest=np.abs(seen.centres[:, 1]))
-    functions = []
-    for seed in range(40):
-        places = np.random.default_rng(seed).uniform([0.0, -8.0], [60.0, 8.0], (96, 2))
-        functions.append(detection_function(PlotTrees(places, np.full(96, 0.2), np.zeros(96)), seen, Stand()))
-    assert np.mean([math.isinf(f.sigma) for f in functions]) >= 0.9, "5 % of complete stands seem incomplete"
+    found = []
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        places = random.uniform([0.0, -15.0], [60.0, 15.0], (200, 2))
+        places = places[random.random(200) < np.exp(-0.5 * np.square(places[:, 1] / sigma))]
+        trees = PlotTrees(places, np.full(len(places), 0.2), np.zeros(len(places)))
+        found.append(detection_function(trees, seen, Stand()).sigma)
+    assert np.median(found) == pytest.approx(sigma, rel=0.1)
 
 
 def test_cells_that_stems_and_their_undergrowth_hide_are_observed():
