@@ -59,7 +59,6 @@ class Dashboard:
     Attributes:
         status: Newest status of the worker.
         recordings: Files to which live runs were recorded so far.
-        run_recordings: Absolute paths of those of the open run.
         shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
         seen: Views of the observed area.
         leaving: Coroutine functions that are called when the run is left, and at the end.
@@ -95,7 +94,6 @@ class Dashboard:
         self.selector = Selector(self)
         self.source = SourceRequest("")
         self.recordings: list[FilePath] = []
-        self.run_recordings: list[str] = []
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.loop = LoopPlayback(self)
@@ -377,7 +375,6 @@ class Dashboard:
         if self.parameters.suit(opened.preset, self.digest):
             self._show_parameters()
         restarted, self._restarts = self.worker.restarts != self._restarts, self.worker.restarts
-        self.run_recordings = self.run_recordings if restarted else []
         self.run_recorder.begin(self.annotation_editor.run, self.source, opened, again=restarted)
         play = self._go or not restarted
         if not play:
@@ -526,7 +523,7 @@ class Dashboard:
         if status.recorded_file:
             file = FilePath(status.recorded_file).absolute()
             self.recordings += [file] if file not in self.recordings else []
-            self.run_recordings += [str(file)] if str(file) not in self.run_recordings else []
+            self.run_recorder.recorded(str(file))
         self.live.publish("status", status)
         if status.scan_index < 0:
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -55,6 +56,7 @@ class Events:
         self._warnings: frozenset[str] = frozenset()
         self._health = "good"
         self._lasting: frozenset[Kind] = frozenset()
+        self._silent_since = math.nan  # [s since the first scan]
         self._base: tuple[str, dict[str, Value]] | None = None
         self._edits = ("", 0)
 
@@ -65,6 +67,7 @@ class Events:
         self._confirmed.clear()
         self._warnings, self._health, self._base = frozenset(), "good", None
         self._lasting = frozenset()
+        self._silent_since = math.nan
         self._edits = ("", 0)
 
     def shown(self, frame: Frame, time_s: float, confirmed_s: Float | None = None) -> bool:
@@ -72,7 +75,8 @@ class Events:
 
         A tree that is confirmed again after stepping back keeps the event of its first confirmation. Flagged
         events up to this time are removed. The pose quality has an event when its state changes; a run begins
-        as "good". An obstacle in the stop zone has an event when it comes and goes. A silence ends.
+        as "good". An obstacle in the stop zone has an event when it comes and goes. A silence ends, except
+        where the scan before it is shown again, for example after a change of parameters.
 
         Args:
             frame: Shown frame; while seeking, not every frame is shown.
@@ -89,6 +93,12 @@ class Events:
         for number in sorted(confirmed - self._confirmed):
             self._note(f"tree {number}", Event(at.get(number, time_s), "tree", f"Tree {number} mapped"))
         self._confirmed |= confirmed
+        if not time_s <= self._silent_since:
+            self._note_changes(frame, time_s)
+        return self._events.keys() != known or bool(passed)
+
+    def _note_changes(self, frame: Frame, time_s: float) -> None:
+        """Add the events of the pose quality, of an obstacle in the stop zone and of a silence that ends."""
         health = frame.health
         if health.state != self._health:
             self._health = health.state
@@ -99,7 +109,6 @@ class Events:
         stop = f"Obstacle in the stop zone, {ahead.ahead:.1f} m ahead" if ahead is not None else ""
         self._turn("stop", is_stop, time_s, stop if is_stop else "No obstacle in the stop zone")
         self._turn("silence", False, time_s, "Data again")
-        return self._events.keys() != known or bool(passed)
 
     def silent(self, why: str, time_s: float) -> bool:
         """Add an event for a robot that sends no data, unless it has one; it ends with the next shown scan.
@@ -112,6 +121,7 @@ class Events:
         """
         if not self._turn("silence", True, time_s, why[:_LONGEST]):
             return False
+        self._silent_since = time_s
         self._lasting -= {"stop"}
         self._health = "good" if self._health == "good" else "unknown"
         return True

@@ -10,7 +10,7 @@ import logging
 import time
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -65,9 +65,15 @@ class _Page:
     scores: dict[str, Any] | None = None
     dirty: bool = False
     changes: list[Change] = field(default_factory=list)
+    recordings: list[str] = field(default_factory=list)
     writer: asyncio.Task[None] | None = None
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     complete: bool = False
+
+    @property
+    def state(self) -> ShownRun | None:
+        """The best state with all recordings; None before the first scan."""
+        return self.best and replace(self.best, recordings=tuple(self.recordings))
 
 
 class RunRecorder:
@@ -88,6 +94,11 @@ class RunRecorder:
     def record(self) -> int | None:
         """Number of the record of the open run; None before it is written."""
         return self._page.record if self._page else None
+
+    @property
+    def recordings(self) -> tuple[str, ...]:
+        """Absolute paths of the files to which the open run was recorded."""
+        return tuple(self._page.recordings) if self._page else ()
 
     def begin(self, run: int | None, source: SourceRequest, opened: Opened, *, again: bool) -> None:
         """Begin the record of an opened run; the one before is written and ended. It appears in the store
@@ -127,6 +138,14 @@ class RunRecorder:
         page.newest = state
         if page.best is None or state.shown.frame.index >= page.best.shown.frame.index:
             page.best, page.scores, page.dirty = state, scores, True
+            self._soon(page)
+
+    def recorded(self, file: str) -> None:
+        """Add the absolute path of a file to which the run is recorded; nothing without a record."""
+        page = self._page
+        if page is not None and file not in page.recordings:
+            page.recordings.append(file)
+            page.dirty = True
             self._soon(page)
 
     def scored(self, scores: dict[str, Any] | None) -> None:
@@ -203,7 +222,7 @@ class RunRecorder:
     async def _write(self, page: _Page) -> None:
         """Write the best state of a record and the changes of parameters if they are not written, creating
         the record if necessary; raises StemmapError if the store refuses, then they stay pending."""
-        state, scores, changes = page.best, page.scores, page.changes
+        state, scores, changes = page.state, page.scores, page.changes
         if state is None or not (page.dirty or changes):
             page.dirty, page.changes = False, []
             return
@@ -227,7 +246,7 @@ class RunRecorder:
     async def _write_files(self, page: _Page) -> None:
         """Write the result files of the best state; nothing without a record. Raises StemmapError if the
         store refuses."""
-        state, record = page.best, page.record
+        state, record = page.state, page.record
         if state is not None and record is not None:
             files = zip_of(await asyncio.to_thread(state.texts))
             await self._ask(lambda store: store.book.put_files(record, files))

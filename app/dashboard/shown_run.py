@@ -100,7 +100,7 @@ class ShownRun:
             dashboard.seen,
             (*editor.rows, *editor.skipped, *editor.others),
             editor.frame,
-            tuple(dashboard.run_recordings),
+            dashboard.run_recorder.recordings,
         )
 
     @property

@@ -65,8 +65,12 @@ def on_cores(function: Callable[[Task], Result], tasks: Iterable[Task]) -> Itera
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(len(os.sched_getaffinity(0)), mp_context=context) as pool:
         running = {pool.submit(function, task): task for task in tasks}
-        for done in as_completed(running):
-            yield running[done], done.result()
+        try:
+            for done in as_completed(running):
+                yield running[done], done.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # those that have not begun
+            raise
 
 
 class Side:

@@ -121,13 +121,13 @@ async def test_a_live_run_names_its_recordings(both: Running, tmp_path: Path) ->
     client, dashboard = both
     live = Status("playing", scan_index=2, live=True)
     await play(dashboard, LIVE, scan=1)
-    for name in ("first.mcap", "first.mcap", "second.mcap"):
-        await dashboard.receive(Report(replace(live, recorded_file=str(tmp_path / name))))
+    names = [str(tmp_path / name) for name in ("first.mcap", "second.mcap")]
+    await dashboard.receive(Report(replace(live, recorded_file=names[0])))
     await show(dashboard, 2, 4)
-    await dashboard.receive(Report(replace(live, state="finished", recorded_file=str(tmp_path / name))))
+    await dashboard.receive(Report(replace(live, recorded_file=names[1])))  # no scan is shown after it
+    await dashboard.receive(Report(replace(live, state="finished", recorded_file=names[1])))
     await play(dashboard, f"{LIVE}2", run=2)
     await dashboard.run_recorder.close()
-    names = [str(tmp_path / "first.mcap"), str(tmp_path / "second.mcap")]
     named = {}
     for row in await runs(client):
         named[row["uri"]] = (await client.get(f"/api/runs/{row['key']}")).json()["map"]["recordings"]

@@ -77,7 +77,11 @@ def test_stops_and_doubts_end_at_a_silence_and_begin_again_after_it():
     stopped = replace(seen(0, 0, lost), clearance=Clearance(Zone.STOP, ahead=0.8))
     events.shown(stopped, 1.0)
     events.silent("Nothing heard for 2 s: the robot is gone", 3.0)
-    assert lasting(events) == [(1.0, "health", 2.0), (1.0, "stop", 2.0), (3.0, "silence", None)]
+    silent = [(1.0, "health", 2.0), (1.0, "stop", 2.0), (3.0, "silence", None)]
+    assert lasting(events) == silent
+    events.shown(stopped, 3.0)  # the last scan, mapped with other parameters
+    assert not events.silent("Nothing heard for 9 s: the robot is gone", 3.0)
+    assert lasting(events) == silent
     events.shown(replace(stopped, index=1), 60.0)
     events.shown(seen(2, 0), 64.0)
     assert lasting(events) == [

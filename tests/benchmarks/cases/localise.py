@@ -161,7 +161,7 @@ def _recorded(root: Path, starts: int, folder: Path) -> list[Table]:
     for task, result in on_cores(_start_of, tasks):
         results[task] = result
         if len(results) % 50 == 0:
-            print(f"{len(results)} of {len(tasks)} ways", file=sys.stderr, flush=True)
+            print(f"{len(results)} of {len(tasks)} starts", file=sys.stderr, flush=True)
     rows: list[tuple[Cell, ...]] = []
     everything: list[Start] = []
     for number, drive in enumerate(drives):
@@ -176,9 +176,9 @@ def _recorded(root: Path, starts: int, folder: Path) -> list[Table]:
     ]
     recall = [k for k, drive in enumerate(drives) if drive.name == RECALL]
     pairs = [(root, folder, k, m) for k in recall for m in range(len(drives)) if m != k]
-    told = dict(on_cores(_frames_of, pairs))
+    found = dict(on_cores(_frames_of, pairs))
     frames = tuple(
-        (RECALL, maps[pair[3]].name, *told[pair], told[pair][0] / max(told[pair][1], 1)) for pair in pairs
+        (RECALL, maps[pair[3]].name, *found[pair], found[pair][0] / max(found[pair][1], 1)) for pair in pairs
     )
     note = "Needed: 100 kB per kilometre. The files have no terrain, because these recordings have none."
     offset = (
