@@ -1,7 +1,7 @@
 """Starts without a pose in stored maps: Wild-Places in each map, simulated stands, and other places.
 
-With STEMMAP_BENCH_MAPS=DIR, the maps are written to a folder and read again by the next run. Remove them after
-a change of the mapping.
+With STEMMAP_BENCH_MAPS=DIR, the maps are written to a folder and read again by the next run. Remove them
+after a change of the mapping.
 """
 
 from __future__ import annotations
