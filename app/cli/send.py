@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from app.cli.flags import compilation_notice
+from app.cli import flags
 
 HELP = "send a recording or a simulated run as a robot does, to practise a live run"
 
@@ -19,11 +20,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="an MCAP recording of ROS 2 topics, or a simulated run such as sim:stand?duration=60",
     )
     parser.add_argument(
-        "--port", type=int, default=7447, metavar="N", help="port of this machine (default: 7447)"
+        "--port",
+        type=flags.whole_number(1, 65535),
+        default=7447,
+        metavar="N",
+        help="port of this machine (default: 7447)",
     )
 
 
-@compilation_notice()
+@flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
     """Send the run once, as soon as somebody listens; return 0.
 
@@ -37,8 +42,9 @@ def run(arguments: argparse.Namespace) -> int:
     with TemporaryDirectory(prefix="stemmap-send-") as folder:
         file = Path(arguments.source)
         if arguments.source.startswith("sim:"):
-            source, file = open_source(arguments.source), Path(folder) / "run.mcap"
-            known = source.description
-            write_recording(file, source.records(), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
+            file = Path(folder) / "run.mcap"
+            with closing(open_source(arguments.source)) as source:
+                known = source.description
+                write_recording(file, source.records(), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
         print(f"{send(file, arguments.port)} scans were sent")
     return 0

@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from app.robot.topics import SCAN_TYPES
+from app.robot.topics import NAME, OWN, SCAN_TYPES
 from app.robot.zenoh import ADMIN, PUBLISHER, data_key
-from pipeline.errors import StemmapError
+from pipeline.errors import SourceError, StemmapError
+from pipeline.io.readers.container import Channel
 from pipeline.io.readers.mcap_file import McapFile
 
+_MSGTYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 _HASH = "RIHS01_0"  # of the message types; stemmap does not compare it
 _POLL_S = 0.1
 _OTHERS_S = 0.5  # until the other topics are subscribed to as well
 
 
 def send(file: Path, port: int) -> int:
-    """Wait until somebody subscribes to the scans, then send all messages but those of stemmap at the pace of
-    the recording, and return the number of scans. What it waits for is printed.
+    """Wait until somebody subscribes to the scans, then send the messages of ROS 2 topics, except those of
+    stemmap, at the pace of the recording, and return the number of scans. What it waits for is printed.
 
     Args:
         file: Recording of ROS 2 topics as MCAP.
-        port: Port of this machine on which it listens.
+        port: Port of this machine on which it listens, at least 1.
 
     Raises:
-        SourceError: The recording cannot be read.
+        SourceError: The recording cannot be read, or has no scans that can be sent.
         StemmapError: The port cannot be used.
     """
     import zenoh
@@ -38,7 +41,14 @@ def send(file: Path, port: int) -> int:
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
     }
     with closing(McapFile(file)) as container:
-        channels = {c.number: c for c in container.channels if "/stemmap/" not in c.topic}
+        channels = {channel.number: channel for channel in container.channels if _is_sent(channel)}
+        scans = {number for number, channel in channels.items() if channel.msgtype in SCAN_TYPES}
+        if not scans:
+            raise SourceError(
+                "the recording has no ROS 2 topic with scans",
+                where=str(file),
+                remedy=f"Name a recording with messages of {' or '.join(SCAN_TYPES)} in CDR",
+            )
         try:
             session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
         except zenoh.ZError as error:
@@ -56,7 +66,6 @@ def send(file: Path, port: int) -> int:
                 publishers[number] = session.declare_publisher(
                     key, congestion_control=zenoh.CongestionControl.BLOCK
                 )
-            scans = {number for number, channel in channels.items() if channel.msgtype in SCAN_TYPES}
             address = f"zenoh:tcp/127.0.0.1:{port}"
             print(f"The robot waits. Open it with: uv run stemmap {address}", flush=True)  # noqa: T201
             while not any(publishers[number].matching_status.matching for number in scans):
@@ -69,3 +78,14 @@ def send(file: Path, port: int) -> int:
                 publishers[message.channel].put(message.payload)
                 sent += message.channel in scans
             return sent
+
+
+def _is_sent(channel: Channel) -> bool:
+    """Return whether a channel has messages of a ROS 2 topic that a live run can choose."""
+    return bool(
+        channel.count
+        and channel.encoding in ("cdr", "")
+        and _MSGTYPE.fullmatch(channel.msgtype)
+        and NAME.fullmatch(channel.topic)
+        and OWN not in channel.topic.split("/")[:-1]
+    )
