@@ -562,20 +562,32 @@ def test_edits_that_wait_while_another_run_is_opened_are_not_made_in_it(person: 
 
 def test_the_name_is_asked_until_it_is_given_and_stored_with_answers(person: Dashboard):
     page = person.page
-    ask = page.locator("#annotate-ask")
+    ask, history = page.locator("#annotate-ask"), page.locator("#review-history").get_by_role("button")
+    first, second, other = doubted(person)[:3]
     expect(ask).to_be_visible()
     expect(page.locator("#annotate-name")).to_be_hidden()
+    page.locator("#map").press("s")
+    person.answer("y")
+    expect(history).to_have_text(["Previous (R)", f"{first['number']} tree"])
     page.locator("#annotate-asked").fill("Ann")
     page.locator("#annotate-asked").press("Enter")
     expect(ask).to_be_hidden()
     expect(page.locator("#annotate-name")).to_be_visible()
     expect(page.locator("#annotate-name")).to_have_value("Ann")
-    page.locator("#map").press("s")
-    person.answer("y")
-    person.until_server("/api/annotations", "it.trees.length === 1 && it.trees[0].who === 'Ann'")
+    expect(page.locator("#review-title")).to_have_text(f"Tree {second['number']}")
+    person.answer("Shift+P")
+    person.until_server("/api/annotations", "it.trees.length === 2 && it.trees[1].who === 'Ann'")
+    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table))"
+    page.evaluate(imported, f"x_m,y_m,class\n{other['x']},{other['y']},tree\n")
+    expect(page.locator("#annotations tbody tr")).to_have_count(3)
+    # The answers before the name are there, and rows that this person imported are no answers.
+    answered = ["Previous (R)", f"{second['number']} pole", f"{first['number']} tree"]
+    expect(history).to_have_text(answered)
     page.reload()
     person.until("() => document.querySelector('#annotate-name')?.value === 'Ann'")
     expect(ask).to_be_hidden()
+    expect(page.locator("#panel-annotate")).to_be_visible()  # the tab that was open
+    expect(history).to_have_text(answered)
 
 
 def test_keys_work_after_a_click_on_next(person: Dashboard):

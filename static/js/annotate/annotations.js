@@ -39,6 +39,7 @@ export const draft = {
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
   shownAt: Infinity, // [ms] time since which it is on the screen
   answer: null, // {number, kind} of the last answer of the review
+  answered: [], // ids of the annotations of the last answers, the newest last
   error: "",
   refused: "", // why the last answer did not count
   undo: {}, // numbers of edits that can be undone, by their subject
@@ -326,7 +327,7 @@ export const byClick = (answers) => (event) => {
 };
 
 async function answer(tree, kind, fields = {}, goesOn = true) {
-  const { number } = tree, seen = annotationOf(tree);
+  const { number } = tree, seen = annotationOf(tree), run = state.annotations?.run;
   if (seen && Object.entries({ kind, ...fields }).every(([name, value]) => seen[name] === value)) {
     Object.assign(draft, { answer: { number, kind, isStored: true }, kind: "other", refused: "" });
     if (goesOn && state.selected === number) await next();
@@ -344,7 +345,9 @@ async function answer(tree, kind, fields = {}, goesOn = true) {
   const given = draft.answer;
   try {
     if (goesOn && state.selected === number) await next();
-    if (!await stored && draft.answer === given) draft.answer = null; // not that of a later tree
+    const done = await stored;
+    if (done && run === state.annotations?.run) keepAnswered(done.id);
+    if (!done && draft.answer === given) draft.answer = null; // not that of a later tree
   } finally {
     answering.delete(number);
     news();
@@ -411,15 +414,19 @@ export function previous() {
   if (tree) lookAt(tree);
 }
 
-// The last trees of the map that this person answered, the newest last.
+// The last trees of the map that were answered in this window, the newest last; those whose answer was undone are open again. The ids
+// of their annotations are kept until the window is closed: a rerun changes the numbers of trees, and `who` of an annotation changes
+// when the person gives a name and is also that of imported ones.
 export function answeredTrees() {
-  const mine = [...rows(), ...skips()].filter(({ who }) => who === myName()).sort((a, b) => a.at_s - b.at_s).map(treeNumberOf);
-  const numbers = new Set();
-  for (const number of [...mine, ...answering]) {
-    numbers.delete(number);
-    numbers.add(number);
-  }
-  return [...numbers].map(treeOf).filter(Boolean).slice(-MOST_ANSWERED);
+  const stored = draft.answered.map((id) => treeNumberOf({ id })).filter((number) => !answering.has(number));
+  return [...new Set([...stored, ...answering])].map(treeOf).filter(Boolean);
+}
+
+const answeredIn = (run) => JSON.parse(recall(`answered.${run}`, "sessionStorage") ?? "[]");
+
+function keepAnswered(id) {
+  draft.answered = [...draft.answered.filter((each) => each !== id), id].slice(-MOST_ANSWERED);
+  remember(`answered.${state.annotations.run}`, JSON.stringify(draft.answered), "sessionStorage");
 }
 
 // What the last answer of the review said ("Tree 40: pole"); "" before the first one.
@@ -505,7 +512,7 @@ export function startAnnotating() {
   on("annotations", () => {
     if (state.annotations.run !== run) {
       run = state.annotations.run;
-      Object.assign(draft, { moved: null, error: "", answer: null });
+      Object.assign(draft, { moved: null, error: "", answer: null, answered: answeredIn(run) });
       versions.clear();
       votes = NO_VOTES;
       updateUndo();
