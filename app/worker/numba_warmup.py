@@ -13,8 +13,8 @@ import itertools
 import os
 import sys
 import time
-from collections.abc import Generator, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Generator, Iterator
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -68,13 +68,18 @@ def compiling() -> Generator[bool, None, None]:
 
 
 def is_compiled() -> bool:
-    """Return whether the kernels of both programs are cached for the current sources, by the kernel that each
-    program compiles last."""
+    """Return whether the kernels of both programs are cached for the current sources, by `last_kernels`."""
     from pipeline.jit import is_kept
-    from pipeline.loop_closure.stem_matching import partners
-    from pipeline.remapping.preview import grouped
 
-    return is_kept(grouped) and is_kept(partners)
+    return all(map(is_kept, last_kernels()))
+
+
+def last_kernels() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Return for each of PROGRAMS the last kernel that it compiles and the other one does not."""
+    from pipeline.detection.cluster_shape import spread_about
+    from pipeline.loop_closure.stem_matching import partners
+
+    return spread_about, partners
 
 
 def is_front_end_compiled() -> bool:
@@ -158,8 +163,8 @@ def warm_up() -> None:
 def compile_scans() -> None:
     """Compile the kernels of the front end, of the columns and of the terrain, which need no SLAM, in the
     order in which a scan needs them, and those of other presets; then those that only whole scans need, see
-    `map_scans`. Before these, it
-    waits up to _OTHER_S for the other program, which would otherwise compile the same kernels."""
+    `map_scans`. Before these, it waits up to _OTHER_S for the other program, which would otherwise compile
+    the same kernels."""
     from pipeline.classification import ColumnClassifier, ScanView
     from pipeline.config import preset
     from pipeline.front_end import detect
@@ -179,7 +184,7 @@ def compile_scans() -> None:
             columns.settle()
         if scan.terrain is not None:
             terrain.add(scan.terrain, pose, scan.sensor_offset)
-    for name in ("paper", "laser2d"):  # which find clusters in another way
+    for name in ("laser2d", "paper"):  # which find clusters in another way
         mapper = _mapper(preset(name))
         detect(mapper.segment(next(_scans())), mapper.parameters.detection)
     until_s = time.monotonic() + _OTHER_S

@@ -18,7 +18,9 @@ ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from app.worker.numba_warmup import compile_scans, compiled_kernels, is_compiled, map_stems, warm_up
+from app.worker.numba_warmup import (
+    compile_scans, compiled_kernels, is_compiled, last_kernels, map_stems, warm_up
+)
 from app.worker.process import new_session
 from app.worker.protocol import Open
 from pipeline.config import PRESETS, Parameters, preset
@@ -38,8 +40,12 @@ def seen():
         for signature in kernel.signatures
     }
 
+last_of_scans, last_of_stems = last_kernels()
 map_stems()
+assert last_of_stems.signatures
+assert not last_of_scans.signatures  # else a process would take this program for both
 compile_scans()
+assert last_of_scans.signatures
 assert is_compiled()
 compiled, of_all = compiled_kernels()
 assert compiled > 0.95 * of_all, compiled
