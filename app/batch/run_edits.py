@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.batch.run_folder import MEASURED, MEASURED_COLUMNS, crs_unit, read_run
+from app.batch.run_folder import MEASURED_COLUMNS, crs_unit, read_run
 from app.store.records import FRAME, KINDS, SKIPPED, Content
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import (
+    BY_PEOPLE,
     CONFIRMED,
     OPEN,
     REJECTED,
@@ -93,7 +94,7 @@ def measured_by_people(
 
 
 def measured_text(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> str:
-    """Return the text of measured.csv, see `measured_by_people`; "" without rows.
+    """Return the text of by_people.csv, see `measured_by_people`; "" without rows.
 
     Args:
         numbers: See `reviews_of`.
@@ -125,7 +126,7 @@ def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content] | N
 @contextmanager
 def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterator[FilePath]:
     """Yield a folder with the run of `folder` in which trees.csv has the reviews by annotations of its
-    recording, and no others, and measured.csv what people measured; the folder itself if there are neither
+    recording, and no others, and by_people.csv what people measured; the folder itself if there are neither
     annotations nor reviews. A temporary folder is removed afterwards; errors name `folder` instead.
 
     Args:
@@ -139,7 +140,7 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
         yield folder
         return
     run = read_run(folder)  # checks the files
-    edited = contents or run.rejected or {*run.reviews.values()} - {OPEN} or (folder / MEASURED).is_file()
+    edited = contents or run.rejected or {*run.reviews.values()} - {OPEN} or (folder / BY_PEOPLE).is_file()
     if not edited:
         yield folder
         return
@@ -162,7 +163,7 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
                 shutil.copy2(folder / name, FilePath(there) / name)  # with its date, which the report states
         written = {"trees.csv": csv_text(TREE_COLUMNS, texts)}
         if measured := measured_text(numbers, position, placed):
-            written[MEASURED] = measured
+            written[BY_PEOPLE] = measured
         write_texts(FilePath(there), written)
         try:
             yield FilePath(there)

@@ -25,6 +25,7 @@ from pipeline.geometry.columns import rows_of
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED
 from pipeline.io.result_files import (
+    BY_PEOPLE,
     PATH_COLUMNS,
     READ_TREE_COLUMNS,
     REJECTED,
@@ -40,8 +41,7 @@ from pipeline.seen_area import CELL, SeenArea
 from pipeline.types.records import Int, Path, Trees, TruthTrees
 
 LARGEST_FILE = 256 << 20
-#: What people measured: trees by tape, and trees that the map lacks, whose `of_tree` is empty.
-MEASURED = "measured.csv"
+#: Columns of BY_PEOPLE; `of_tree` is empty for a tree that the map lacks.
 MEASURED_COLUMNS = ("of_tree", "x_m", "y_m", "dbh_tape_cm")
 _FILES = (
     "trees.csv",
@@ -151,14 +151,14 @@ def read_terrain(folder: FilePath) -> Float:
 
 
 def read_measured(folder: FilePath) -> dict[str, Float]:
-    """Return the columns of measured.csv by their names, shape (rows,) each; no rows without this file.
+    """Return the columns of by_people.csv by their names, shape (rows,) each; no rows without this file.
 
     Raises:
         SourceError: The file is damaged.
     """
-    if not (folder / MEASURED).is_file():
+    if not (folder / BY_PEOPLE).is_file():
         return {name: np.zeros(0) for name in MEASURED_COLUMNS}
-    return _columns(folder / MEASURED, MEASURED_COLUMNS)
+    return _columns(folder / BY_PEOPLE, MEASURED_COLUMNS)
 
 
 #: Earlier times count from the start of a sensor [ns since 1970].

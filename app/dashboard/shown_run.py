@@ -15,7 +15,7 @@ import numpy as np
 
 from app.batch.map_frame import write_map_frame
 from app.batch.run_edits import measured_by_people, measured_text, reviews_of
-from app.batch.run_folder import MEASURED, as_written, recorded_time, score_map
+from app.batch.run_folder import as_written, recorded_time, score_map
 from app.batch.summary import far_truth, left_out_warning, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
@@ -27,6 +27,7 @@ from pipeline.config import Parameters
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import (
+    BY_PEOPLE,
     PATH_COLUMNS,
     REJECTED,
     TERRAIN_COLUMNS,
@@ -129,12 +130,12 @@ class ShownRun:
         return trees.number[trees.confirmed].tolist(), trees.position[trees.confirmed]
 
     def _measured(self) -> dict[str, str]:
-        """Return the text of measured.csv by its name; {} if nobody measured a tree."""
+        """Return the text of by_people.csv by its name; {} if nobody measured a tree."""
         numbers, position = self._numbered()
         x, y = self.offset[:2]
         contents = [replace(row.content, x=row.content.x + x, y=row.content.y + y) for row in self.edits]
         text = measured_text(numbers, position + np.array([x, y]), contents)
-        return {MEASURED: self._in_units(text)} if text else {}
+        return {BY_PEOPLE: self._in_units(text)} if text else {}
 
     def trees_text(self) -> str:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
@@ -175,7 +176,7 @@ class ShownRun:
             yield FilePath(name)
 
     def texts(self, *, with_seen: bool = True) -> dict[str, str]:
-        """Return a dict from the names trees.csv, path.csv, seen.csv (only if `with_seen`), measured.csv (if
+        """Return a dict from the names trees.csv, path.csv, seen.csv (only if `with_seen`), by_people.csv (if
         people measured trees), terrain.csv and run.json to the texts of these files. terrain.csv has only its
         header if the newest results have no ground."""
         ground, offset = self.shown.frame.ground, self.offset

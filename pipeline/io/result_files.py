@@ -21,6 +21,9 @@ from pipeline.seen_area import SeenArea
 from pipeline.types.records import Bool, Frame, HeightMap, Int, Path, Trees, Verdict
 
 ROWS = "detections.csv"  # written during the run
+#: What people measured: trees of the map by tape, and trees that the map lacks. The name is not measured.csv,
+#: because a user may have a table of that name for `evaluate` in the same folder.
+BY_PEOPLE = "by_people.csv"
 #: States of a tree in the review by a person.
 OPEN, CONFIRMED, REJECTED, SKIPPED = REVIEWS = ("open", "confirmed", "rejected", "skipped")
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")

@@ -133,10 +133,17 @@ def test_plots_have_the_numbers_of_trees_with_each_value(tmp_path, capsys, suffi
         assert [plot[name] for name in names] == [4, 3, 2, volumes]
 
 
+def test_a_table_of_measured_trees_in_the_folder_is_no_file_of_the_run(tmp_path, capsys):
+    run = grid_run(tmp_path / "run")
+    (run / "measured.csv").write_text("x_m,y_m,dbh_cm\n9.0,1.0,23.4\n")  # for `evaluate --truth`
+    assert stemmap(capsys, "export", run, "--to", tmp_path / "trees.geojson").code == 0
+    assert stemmap(capsys, "report", run, "--out", tmp_path / "report.html").code == 0
+
+
 def test_what_people_measured_is_in_every_format(tmp_path, capsys):
     run = grid_run(tmp_path / "run")
     stemmap(capsys, "georeference", run, "--by-hand", "500000,5300000,0", "--crs", "EPSG:25832")
-    (run / "measured.csv").write_text(
+    (run / "by_people.csv").write_text(
         "of_tree,x_m,y_m,dbh_tape_cm\n5,9.000,1.000,23.4\n,2.000,2.000,31.0\n,4,2,\n"
     )
     files = {suffix: tmp_path / f"trees.{suffix}" for suffix in ("gpkg", "shp", "xlsx", "dxf", "geojson")}
