@@ -50,6 +50,7 @@ _FILES = (
     "detections.csv",
     "terrain.csv",
     "seen.csv",
+    BY_PEOPLE,
     "slices.csv",
     "state.zip",
 )

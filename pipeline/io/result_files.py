@@ -264,6 +264,8 @@ def csv_in_units(text: str, unit: tuple[float, float], *, to_metres: bool = Fals
 
 #: Poses of the LiDAR by LiDAR odometry, as TUM rows.
 ODOMETRY = "odometry.tum"
+#: Files of an earlier map that are wrong for a new one, which may have another frame and other tree numbers.
+OF_EARLIER_MAP = ("seen.csv", "georeference.json", BY_PEOPLE, ODOMETRY)
 
 
 def tum_text(poses: Iterable[tuple[int, Pose3]]) -> str:
@@ -340,8 +342,8 @@ class RunFiles:
         state: bytes | None,
         further: Mapping[str, str] | None = None,
     ) -> None:
-        """Write the other files and move all files to their names, `run.json` last. Files `seen.csv`,
-        `georeference.json`, ODOMETRY and (without a new state) `state.zip` of an earlier run are removed.
+        """Write the other files and move all files to their names, `run.json` last. Files OF_EARLIER_MAP and
+        (without a new state) `state.zip` of an earlier run are removed.
 
         Args:
             trees, path: The map; confirmed trees are written.
@@ -371,8 +373,7 @@ class RunFiles:
             (self._staging / name).write_text(text, encoding="utf-8", newline="")
         texts.pop(ROWS, None)
         states = [] if state is None else ["state.zip"]
-        # Of an earlier run, which may have another frame.
-        for name in ("seen.csv", "georeference.json", ODOMETRY):
+        for name in OF_EARLIER_MAP:
             (self._folder / name).unlink(missing_ok=True)
         if state is None:
             (self._folder / "state.zip").unlink(missing_ok=True)

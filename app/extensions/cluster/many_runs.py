@@ -30,12 +30,10 @@ from app.common.child_process import (
 from app.common.task_pool import TaskPool
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import UNFINISHED, write_texts
-from pipeline.io.result_files import ODOMETRY
+from pipeline.io.result_files import OF_EARLIER_MAP
 
 TABLE = "runs.csv"
 _COLUMNS = ("run", "exit_code", "trees", "scans", "distance_m", "message")
-#: Files of an earlier map, which may have another frame, as `RunFiles.finish` removes them.
-_OF_EARLIER = ("seen.csv", "georeference.json", ODOMETRY, "state.zip")
 #: First words of the messages about a run. Other lines, such as the progress of a compilation, depend on the
 #: machine and are left out.
 _ABOUT_RUN = ("warning: ", "left out: ", "stemmap: ")
@@ -195,7 +193,7 @@ def _written(folder: Path, result: MappedFiles, *, force: bool) -> MappedFiles:
     except (StemmapError, KeyError, ValueError) as error:
         return MappedFiles(_CANNOT_RUN, [*result.messages, f"stemmap: {error}"], {})
     folder.mkdir(exist_ok=True)
-    for name in _OF_EARLIER:
+    for name in (*OF_EARLIER_MAP, "state.zip"):
         if name not in result.files:
             (folder / name).unlink(missing_ok=True)
     with TemporaryDirectory(prefix=UNFINISHED, dir=folder) as parent:

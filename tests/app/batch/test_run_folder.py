@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from app.batch.run_folder import read_run
+from app.batch.run_folder import check_folder, read_run
 from app.cli import main
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, StemmapError
 from tests.app.batch.finished_runs import grid_run
 
 
@@ -21,6 +21,12 @@ def test_a_map_says_at_its_start_what_lies_in_its_folder(
     first, second, *_ = capsys.readouterr().err.splitlines()
     assert ".unfinished-abc is the partial output of a run that was killed" in first
     assert "unfinished" not in second
+
+
+def test_measurements_of_people_without_a_run_are_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "by_people.csv").write_text("of_tree,x_m,y_m,dbh_tape_cm\n1,1,2,30\n")
+    with pytest.raises(StemmapError, match=r"a file by_people\.csv that is not from a run"):
+        check_folder(tmp_path, "00", force=False)
 
 
 def test_a_cell_that_is_too_long_is_a_damaged_row(tmp_path: Path) -> None:

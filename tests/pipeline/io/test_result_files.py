@@ -199,6 +199,12 @@ def test_another_run_replaces_the_first_and_leaves_strange_files_alone(tmp_path)
     assert told["notes.txt"] == b"mine"
 
 
+def test_another_run_removes_what_people_measured_by_the_tree_numbers_of_the_first(tmp_path):
+    write(tmp_path)
+    (tmp_path / "by_people.csv").write_text("of_tree,x_m,y_m,dbh_tape_cm\n1,1,2,30\n")
+    assert set(write(tmp_path)) == NAMES
+
+
 def test_nothing_is_there_before_the_end(tmp_path):
     files = RunFiles(tmp_path / "new")
     files.add(a_frame(), 0)

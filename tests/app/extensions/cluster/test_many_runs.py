@@ -73,9 +73,11 @@ def test_a_folder_with_the_map_of_another_source_is_kept_unless_forced(tmp_path)
 
     assert mapped("first") == [0]
     (tmp_path / "a" / "notes.txt").write_text("by a person")
-    (tmp_path / "a" / "seen.csv").write_text("of an earlier map")
+    earlier = [tmp_path / "a" / name for name in ("seen.csv", "by_people.csv")]
+    for file in earlier:
+        file.write_text("of an earlier map")
     assert mapped("first") == [0]
-    assert not (tmp_path / "a" / "seen.csv").exists()
+    assert not any(file.exists() for file in earlier)
     assert mapped("second") == [1]
     assert "another source" in rows_of(tmp_path)["a"]["message"]
     assert (tmp_path / "a" / "words.txt").read_text() == '["first"]'
