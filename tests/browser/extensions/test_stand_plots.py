@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 
 from tests.browser.conftest import opened_by_another
 from tests.browser.dashboard import Dashboard
@@ -142,6 +143,42 @@ def test_the_heading_of_the_report_is_typed_once(person: Dashboard) -> None:
     expect(fields.nth(0)).to_have_value("")
 
 
+def test_names_of_the_heading_stay_while_others_are_stored_and_after_a_refusal(person: Dashboard) -> None:
+    page = person.page
+    fields = page.locator("#report-heading input")
+    sent: list[Route] = []
+    page.route("**/api/heading", lambda route: sent.append(route))
+    for row, name in enumerate(("Hohe Warte", "the town")):
+        fields.nth(row).fill(name)
+        fields.nth(row).press("Tab")
+    person.eventually(lambda: len(sent) == 1, lambda: sent)
+    sent[0].continue_()
+    person.eventually(lambda: len(sent) == 2, lambda: sent)  # the first edit has come back
+    names = [json.loads(route.request.post_data or "")["names"] for route in sent]
+    assert names == [{"stand": "Hohe Warte"}, {"client": "the town"}]
+    expect(fields.nth(1)).to_have_value("the town")
+    refusal = {"error": {"what": "the names are refused", "where": "", "remedy": ""}}
+    sent[1].fulfill(status=422, json=refusal)
+    expect(page.locator("#plots-error")).to_have_text("The names are refused.")
+    expect(fields.nth(1)).to_have_attribute("aria-invalid", "true")
+    expect(fields.nth(1)).to_have_value("the town")
+    page.unroute("**/api/heading")
+    fields.nth(2).fill("Ann")
+    fields.nth(2).press("Tab")
+    person.until_server("/api/annotations", "it.others.heading?.[0].author === 'Ann'")
+    expect(fields.nth(1)).to_have_value("the town")
+    fields.nth(1).fill("the city")
+    fields.nth(1).press("Tab")
+    person.until_server("/api/annotations", "it.others.heading?.[0].client === 'the city'")
+    expect(fields.nth(1)).to_have_attribute("aria-invalid", "false")
+    assert person.ask("/api/annotations")["others"]["heading"][0]["stand"] == "Hohe Warte"
+    for _ in range(3):
+        page.locator("#plot-undo").click()
+    person.until_server("/api/annotations", "!it.others.heading?.length")
+    expect(fields.nth(1)).to_have_value("")
+    person.errors.clear()  # the browser logs an answer that refuses
+
+
 def test_another_run_begins_with_empty_fields(person: Dashboard) -> None:
     page = person.page
     page.get_by_text("Type a plot").click()
@@ -150,11 +187,13 @@ def test_another_run_begins_with_empty_fields(person: Dashboard) -> None:
     form.locator("[name=x]").fill("6")
     form.locator("[name=name]").fill("north")
     page.locator("#plot-crs").fill("EPSG:25832")
+    page.locator("#report-heading input").first.fill("typed for the run before")
     person.open("sim:stand?seed=3&duration=2")
     expect(form.locator("[name=x]")).to_have_value("0")
     expect(form.locator("[name=name]")).to_have_value("")
     expect(form.locator("[name=radius]")).to_have_value("5.64")
     expect(page.locator("#plot-crs")).to_have_value("")
+    expect(page.locator("#report-heading input").first).to_have_value("")
 
 
 def test_viewers_see_plots_and_cannot_change_them(

@@ -11,7 +11,7 @@ import { isDrive, on, state, trees } from "../../core/store.js";
 import { keepFresh } from "../../core/timing.js";
 import { titleOf } from "../../open/run_title.js";
 import { startCoordinates } from "./coordinates.js";
-import { fillHeading, headingFields, headingSaved } from "./heading.js";
+import { fillHeading, headingFields, headingSaved, resetHeading } from "./heading.js";
 import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plots, plotting, SHAPES, sketch, stopDrawing } from "./plots.js";
 import { reportMenu } from "./report.js";
 
@@ -245,6 +245,7 @@ function resetFields() {
   inFile(0, 0).forEach((value, axis) => { document.querySelector(`#plots-edit [name=${["x", "y"][axis]}]`).defaultValue = value; });
   for (const form of document.querySelectorAll("#plots-edit form")) form.reset();
   byId("plot-crs").value = "";
+  resetHeading();
   for (const { node } of lines.values()) node.remove();
   lines.clear();
 }

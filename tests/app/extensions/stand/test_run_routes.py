@@ -127,6 +127,19 @@ async def test_the_report_of_a_run_is_that_of_the_command_line(both: Running, tm
     for wrong in ("a\x07", "a" * 101):
         refused = await client.put("/api/heading", json={**body, "names": {**names, "stand": wrong}})
         assert refused.status_code == 422
+    for browser, part in (
+        ("b", {"client": "the town"}),
+        ("a", {"stand": "Warte"}),
+        ("a", {"client": ""}),
+        ("a", {}),
+    ):
+        edit = {**body, "browser": browser * 16, "names": part}
+        assert (await client.put("/api/heading", json=edit)).status_code == 200
+        (kept,) = (await client.get("/api/annotations")).json()["others"]["heading"]
+        assert kept["author"] == "Ann Lee", "only the fields of the request change"
+        assert part.items() <= kept.items()
+    assert kept["stand"] == "Warte"
+    assert (await client.put("/api/heading", json={**body, "names": names})).status_code == 200
 
     english = (await client.get("/api/runs/open/report/html")).text
     assert "Ann Lee" in english
