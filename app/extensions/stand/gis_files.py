@@ -182,10 +182,7 @@ def _write_shapefiles(run: PlottedRun, file: FilePath) -> None:
 
 
 def _write_dxf(run: PlottedRun, file: FilePath) -> None:
-    """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS, CONTOURS and, if people added
-    trees, ADDED. A tree without a
-    diameter is a point without a circle, one without a ground height has z 0. StemmapError if ezdxf or
-    contourpy is not installed, or the terrain covers too large an area."""
+    """Write a DXF drawing in metres; without a diameter, a tree has no circle."""
     ezdxf = gis_package("ezdxf", "DXF files")
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
