@@ -8,7 +8,7 @@ from pathlib import Path
 
 import geopandas
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from tests.browser.dashboard import Dashboard
 from tests.browser.extensions.test_stand_plots import shown_plots
@@ -40,7 +40,7 @@ def test_a_wrong_row_of_a_file_is_mended_in_the_table(person: Dashboard, tmp_pat
     file.write_text("\n".join(["tree,easting,northing", *lines]))
     page.get_by_label("File of control points").set_input_files(file)
     expect(problem).to_have_text(
-        re.compile(r"^Point tree \d+, line 3: easting = '5OOOOO' is not a number\. Correct it")
+        re.compile(r"^Point tree \d+, line 3: easting = '5OOOOO' is not a number\. Correct or delete it")
     )
     rows = page.locator("#control-points tbody tr")
     expect(rows).to_have_count(3)
@@ -56,6 +56,62 @@ def test_a_wrong_row_of_a_file_is_mended_in_the_table(person: Dashboard, tmp_pat
     expect(problem).to_be_hidden()
     page.locator("#plot-undo").click()
     expect(page.locator("#coordinates-now")).to_have_text("Coordinates: local")
+
+
+def test_each_wrong_row_of_a_file_is_marked_until_it_is_changed(person: Dashboard, tmp_path: Path) -> None:
+    page, problem = person.page, person.page.locator("#plots-error")
+    page.locator("#coordinates-now").click()
+    page.locator("#coordinates-crs").fill("EPSG:25832")
+    trees = person.ask("/api/trees")["trees"][:5]
+    lines = [f"{t['number']},{EAST + t['x']:.3f},{NORTH + t['y']:.3f},high" for t in trees]
+    lines[0] = lines[0].replace("high", "9.5")
+    file = tmp_path / "points.csv"
+    file.write_text("\n".join(["tree,easting,northing,elevation_m", *lines]))
+    page.get_by_label("File of control points").set_input_files(file)
+    expect(problem).to_have_text(re.compile(r"and 1 more row\. Correct or delete them"))
+    rows = page.locator("#control-points tbody tr")
+    wrong = page.locator("#control-points [aria-invalid=true]")
+    expect(rows.nth(0).locator("[name=z]")).to_have_attribute("aria-invalid", "false")
+    fault = re.compile("line 6: elevation_m = 'high' is not a number")
+    expect(rows.nth(4).locator("[name=z]")).to_have_attribute("aria-invalid", "true")
+    expect(rows.nth(4).locator("[name=z]")).to_have_attribute("title", fault)
+    for row in (1, 2, 3):
+        rows.nth(row).locator("[name=z]").fill("9.5")
+    expect(rows.nth(3).locator("[name=z]")).to_have_attribute("title", re.compile("^Height"))
+    page.locator("#coordinates-apply").click()
+    expect(problem).to_have_text(fault)
+    assert person.ask("/api/annotations")["frame"] is None
+    rows.nth(4).locator("[name=z]").fill("9.5")
+    expect(wrong).to_have_count(0)
+    for row in range(5):
+        rows.nth(row).locator("[name=z]").fill("")  # not every tree has terrain yet
+    page.locator("#coordinates-apply").click()
+    expect(page.locator("#coordinates-now")).to_have_text("Coordinates: EPSG:25832")
+
+
+def test_a_file_that_is_read_while_another_run_is_opened_is_not_applied(
+    person: Dashboard, tmp_path: Path
+) -> None:
+    page, sent = person.page, list[Route]()
+    page.locator("#coordinates-now").click()
+    page.locator("#coordinates-crs").fill("EPSG:25832")
+    trees = person.ask("/api/trees")["trees"][:2]
+    lines = [f"{t['number']},{EAST + t['x']:.3f},{NORTH + t['y']:.3f}" for t in trees]
+    file = tmp_path / "points.csv"
+    file.write_text("\n".join(["tree,easting,northing", *lines]))
+    page.route("**/api/georeference/points", lambda route: sent.append(route))
+    page.get_by_label("File of control points").set_input_files(file)
+    person.eventually(lambda: bool(sent), lambda: sent)
+    person.open("sim:stand?seed=3&duration=2")
+    expect(page.locator("#coordinates-crs")).to_have_value("")  # the page shows the other run
+    unknown = dict.fromkeys(("x", "y", "z"))
+    points = [
+        {"name": "", "tree": t["number"], "east": EAST + t["x"], "north": NORTH + t["y"], **unknown}
+        for t in trees
+    ]
+    sent[0].fulfill(json={"points": points, "faults": []})
+    expect(page.locator("#plots-error")).to_have_text(re.compile("^Another run was opened meanwhile"))
+    expect(page.locator("#control-points tbody tr")).to_have_count(0)
 
 
 def test_control_points_are_picked_fitted_and_undone(person: Dashboard, tmp_path: Path) -> None:

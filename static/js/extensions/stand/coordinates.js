@@ -19,7 +19,9 @@ const POINT_SIGMA = 0.125; // m, that of the command line
 
 const MOST_FAULTS = 3; // in a message
 
-let points = []; // {name, tree, x, y, east, north, z}: the place of a tree is that of its number in the map
+// {name, tree, x, y, east, north, z, fault}: the place of a tree is that of its number in the map; `fault` is what the server could
+// not read in a row of a file, until the row is changed.
+let points = [];
 let shown = ""; // what was loaded of the stored reference system
 let dirty = false; // whether the fields differ from the stored ones
 
@@ -79,8 +81,13 @@ function asked() {
 
 async function apply(by) {
   const crs = byId("coordinates-crs").value.trim();
+  const faulty = points.flatMap((point, row) => (by.points && point.fault ? [`point ${titleOf(point, row)}, ${point.fault}`] : []));
   const open = (by.points ?? []).flatMap((point, row) => (point.east === null || point.north === null ? [titleOf(point, row)] : []));
   if (!crs) return fail("Name the reference system, such as EPSG:25832.");
+  if (faulty.length) {
+    const more = faulty.length - MOST_FAULTS;
+    return fail(`${faulty.slice(0, MOST_FAULTS).join("; ")}${more > 0 ? `; and ${count(more, "more row")}` : ""}. Correct or delete ${faulty.length > 1 ? "them" : "it"} in the table, then press Apply.`);
+  }
   if (open.length) return fail(`East or north is missing: ${open.join(", ")}.`);
   if (by.how === "hand" && (by.east === null || by.north === null)) return fail("Give east and north of the map's origin.");
   if (by.how === "hand") Object.assign(by, { turn_deg: by.turn_deg ?? 0, z: by.z ?? 0 });
@@ -98,7 +105,7 @@ const typed = ({ tree, name, ...of }) => ({ ...Object.fromEntries(Object.entries
 
 // Fills the table with the rows of a file, so that a wrong one can be mended here, and applies them if all could be read.
 async function importTable(table) {
-  const crs = byId("coordinates-crs").value.trim();
+  const crs = byId("coordinates-crs").value.trim(), run = state.annotations?.run;
   if (!crs) return fail("Name the reference system, such as EPSG:25832.");
   let read;
   try {
@@ -106,13 +113,12 @@ async function importTable(table) {
   } catch (error) {
     return fail(error.message);
   }
+  if (run !== state.annotations?.run) return fail("Another run was opened meanwhile: the file was not imported.");
   points = read.points.map(typed);
+  for (const [row, text] of read.faults) points[row].fault = text;
   byId("coordinates-how").value = "control";
   changed();
-  if (!read.faults.length) return apply(asked());
-  const texts = read.faults.slice(0, MOST_FAULTS).map(([row, text]) => `point ${titleOf(points[row], row)}, ${text}`);
-  const more = read.faults.length - texts.length;
-  return fail(`${texts.join("; ")}${more ? `; and ${count(more, "more row")}` : ""}. Correct ${read.faults.length > 1 ? "them" : "it"} in the table, then press Apply.`);
+  return apply(asked());
 }
 
 // --- the controls ---------------------------------------------------------------------------------------------------
@@ -163,20 +169,32 @@ function fillResiduals() {
   document.querySelectorAll("#control-points .residual").forEach((each, row) => setText(each, residualText(found[row])));
 }
 
+// Marks the fields of the rows that the server could not read.
+function markFaults() {
+  points.forEach(({ fault }, row) => {
+    for (const input of byId("control-points").tBodies[0].rows[row].querySelectorAll("input")) {
+      input.title = fault ?? COLUMNS.find(([name]) => name === input.name)[2];
+      input.setAttribute("aria-invalid", String(Boolean(fault)));
+    }
+  });
+}
+
 function cell(point, row, name, title) {
-  if (name === "tree") return el("td", {}, el("input", { name, type: "number", min: "1", step: "1", value: point.tree ?? "", title, "aria-label": `${title} of point ${row + 1}`,
-    onchange: ({ target }) => { point.tree = number(target.value); changed(); } })); // the place is then that of the tree
+  if (name === "tree") return el("td", {}, el("input", { name, type: "number", min: "1", step: "1", value: point.tree ?? "", "aria-label": `${title} of point ${row + 1}`,
+    onchange: ({ target }) => { point.tree = number(target.value); delete point.fault; changed(); } })); // the place is then that of the tree
   const axis = PLACE.indexOf(name);
   const known = number((point.tree === null ? point : treeOf(point.tree))?.[name] ?? "");
   const written = axis < 0 || known === null ? null : inFile(known, known)[axis];
   if (point.tree !== null && axis >= 0) return el("td", { text: fixed(written, 3) });
   const value = axis < 0 ? point[name] : written === null ? "" : written.toFixed(3);
-  return el("td", {}, el("input", { name, value: String(value ?? ""), title, type: name === "name" ? "text" : "number", step: "any", maxlength: "60", autocomplete: "off", "aria-label": `${title} of point ${row + 1}`,
+  return el("td", {}, el("input", { name, value: String(value ?? ""), type: name === "name" ? "text" : "number", step: "any", maxlength: "60", autocomplete: "off", "aria-label": `${title} of point ${row + 1}`,
     placeholder: name === "name" ? titleOf({ ...point, name: "" }, row) : null,
     oninput: (event) => {
-      const typed = number(event.target.value);
-      point[name] = axis < 0 ? event.target.value : typed === null ? "" : inMap(typed, typed)[axis];
+      const given = number(event.target.value);
+      point[name] = axis < 0 ? event.target.value : given === null ? "" : inMap(given, given)[axis];
+      delete point.fault;
       dirty = true;
+      markFaults();
       draft.error = ""; // it was about the fields before
       fillResiduals();
       news();
@@ -190,6 +208,7 @@ function fillTable() {
     el("td", { class: "residual" }),
     el("td", {}, el("button", { type: "button", class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete point ${row + 1}`, onclick: () => { points.splice(row, 1); changed(); } })))));
   table.hidden = !points.length;
+  markFaults();
   fillResiduals();
 }
 
