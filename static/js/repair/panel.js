@@ -86,7 +86,7 @@ function lineOf(row, problem, numbers, agreeing) {
 function fill() {
   if (!repairing()) return;
   const rows = [...repairs()].sort((a, b) => a.id - b.id), problems = state.map?.problems ?? [];
-  const known = problems.length === rows.length && state.map?.repairs === state.annotations?.repairs; // else the map does not have them yet
+  const known = Boolean(state.map) && problems.length === rows.length && state.map.repairs === state.annotations?.repairs; // else the map does not have them yet
   const left = known ? problems.filter(Boolean).length : 0;
   setText(byId("repair-count"), rows.length ? `${count(rows.length, "repair")}${left ? `, ${left} not applied` : ""}` : "No repairs");
   byId("repair-undo").disabled = !canUndo();

@@ -1,7 +1,7 @@
 // The tabs below the map (ARIA pattern), and the drawer that holds map and tabs in a narrow window.
 
 import { byId, el, recall, remember } from "../core/dom.js";
-import { changed } from "../core/store.js";
+import { changed, on, state } from "../core/store.js";
 import { ofExtensions } from "./extensions.js";
 
 export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "repair", "scores", "charts"];
@@ -45,10 +45,14 @@ export function startTabs() {
   }
 }
 
-// Opens the tab that was open before this window was loaded again.
+// Opens the tab that was open before this window was loaded again, once there is a map for it to show.
 export function restoreTab() {
-  const name = recall("tab", "sessionStorage");
-  if (NAMES.includes(name)) openTab(name);
+  let name = recall("tab", "sessionStorage");
+  on("map", () => {
+    if (!state.map || !name) return;
+    if (NAMES.includes(name) && current === NAMES[0]) openTab(name);
+    name = null;
+  });
 }
 
 export function startDrawer() {
