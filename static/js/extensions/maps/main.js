@@ -48,7 +48,7 @@ async function choose() {
   const go = button("localise-go", "Locate", "Search the stems of the open run in this map", locate, "primary");
   go.disabled = !rows.length;
   dialog.append(el("h2", { id: "localise-title", text: "Locate in a stored map" }),
-    el("p", { class: "note dim", text: rows.length ? "The robot is searched among the trees of an earlier run; no start pose is needed. That map does not change." : "There is no stored run yet." }),
+    el("p", { class: "note dim", text: rows.length ? "The robot is searched among the trees of an earlier run; no start pose is needed. That map does not change." : "There is no stored run yet: a run is listed here after this page has mapped it. Maps in folders are for the command: stemmap localise RUN --map DIR" }),
     el("label", { for: "localise-run", text: "Run with the map" }), select, problem,
     el("div", { class: "row end" }, button("localise-cancel", "Cancel", "", () => dialog.close(), ""), go));
   dialog.addEventListener("close", () => dialog.remove());
