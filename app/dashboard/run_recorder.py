@@ -73,7 +73,9 @@ class _Page:
     @property
     def state(self) -> ShownRun | None:
         """The best state with all recordings; None before the first scan."""
-        return self.best and replace(self.best, recordings=tuple(self.recordings))
+        if self.best is None or not self.recordings:
+            return self.best
+        return replace(self.best, recordings=tuple(self.recordings))
 
 
 class RunRecorder:
