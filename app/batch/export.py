@@ -32,7 +32,7 @@ from app.batch.map_frame import (
     read_map_frame,
     reproject,
 )
-from app.batch.run_folder import read_measured, read_run, read_terrain
+from app.batch.run_folder import read_by_people, read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import ROBOTS_FRAME, geojson
@@ -152,7 +152,7 @@ def read_for_export(folder: FilePath) -> ExportedRun:
     trees, path, terrain = run.trees, run.path, read_terrain(folder)
     ground = heights_at(terrain, trees.position) + frame.z
     unknown = np.full(len(trees.number), np.nan)
-    measured = read_measured(folder)
+    measured = read_by_people(folder)
     lacks = np.isnan(measured["of_tree"])
     tape = dict(zip(measured["of_tree"].tolist(), measured["dbh_tape_cm"].tolist(), strict=True))
     values = (

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.batch.run_folder import MEASURED_COLUMNS, crs_unit, read_run
+from app.batch.run_folder import BY_PEOPLE_COLUMNS, crs_unit, read_run
 from app.store.records import FRAME, KINDS, SKIPPED, Content
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
@@ -93,7 +93,7 @@ def measured_by_people(
     return tape, [content for k, content in enumerate(trees) if distance[k] >= SAME_THING]
 
 
-def measured_text(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> str:
+def by_people_text(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> str:
     """Return the text of by_people.csv, see `measured_by_people`; "" without rows.
 
     Args:
@@ -107,7 +107,7 @@ def measured_text(numbers: Sequence[int], position: Float, contents: Iterable[Co
     cells = [
         (name, number_text(x, 3), number_text(y, 3), number_text(100.0 * d, 1)) for name, x, y, d in rows
     ]
-    return csv_text(MEASURED_COLUMNS, cells) if cells else ""
+    return csv_text(BY_PEOPLE_COLUMNS, cells) if cells else ""
 
 
 def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content] | None:
@@ -162,7 +162,7 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
             if (folder / name).is_file():
                 shutil.copy2(folder / name, FilePath(there) / name)  # with its date, which the report states
         written = {"trees.csv": csv_text(TREE_COLUMNS, texts)}
-        if measured := measured_text(numbers, position, placed):
+        if measured := by_people_text(numbers, position, placed):
             written[BY_PEOPLE] = measured
         write_texts(FilePath(there), written)
         try:

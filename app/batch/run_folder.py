@@ -42,7 +42,7 @@ from pipeline.types.records import Int, Path, Trees, TruthTrees
 
 LARGEST_FILE = 256 << 20
 #: Columns of BY_PEOPLE; `of_tree` is empty for a tree that the map lacks.
-MEASURED_COLUMNS = ("of_tree", "x_m", "y_m", "dbh_tape_cm")
+BY_PEOPLE_COLUMNS = ("of_tree", "x_m", "y_m", "dbh_tape_cm")
 _FILES = (
     "trees.csv",
     "path.csv",
@@ -151,15 +151,15 @@ def read_terrain(folder: FilePath) -> Float:
     return np.stack([c["x_m"], c["y_m"], c["z_m"]], axis=1)
 
 
-def read_measured(folder: FilePath) -> dict[str, Float]:
+def read_by_people(folder: FilePath) -> dict[str, Float]:
     """Return the columns of by_people.csv by their names, shape (rows,) each; no rows without this file.
 
     Raises:
         SourceError: The file is damaged.
     """
     if not (folder / BY_PEOPLE).is_file():
-        return {name: np.zeros(0) for name in MEASURED_COLUMNS}
-    return _columns(folder / BY_PEOPLE, MEASURED_COLUMNS)
+        return {name: np.zeros(0) for name in BY_PEOPLE_COLUMNS}
+    return _columns(folder / BY_PEOPLE, BY_PEOPLE_COLUMNS)
 
 
 #: Earlier times count from the start of a sensor [ns since 1970].

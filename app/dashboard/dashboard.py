@@ -522,7 +522,8 @@ class Dashboard:
             self.run_recorder.finished()
         if status.recorded_file:
             file = FilePath(status.recorded_file).absolute()
-            self.recordings += [file] if file not in self.recordings else []
+            if file not in self.recordings:
+                self.recordings.append(file)
             self.run_recorder.recorded(str(file))
         self.live.publish("status", status)
         if status.scan_index < 0:

@@ -15,7 +15,7 @@ from pipeline.types.records import Float, Frame, Zone
 
 Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "silence"]
 
-_LASTING = ("health", "stop", "silence")
+_LASTING_KINDS = ("health", "stop", "silence")
 _OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
 #: Count at the end of a warning, such as "scans lost on the network (3)".
@@ -211,7 +211,7 @@ class Events:
                 end_s = ends.get(event.kind)
                 each["for_s"] = None if end_s is None else round(end_s - event.time_s, 2)
             is_silence = event.kind == "silence" and event.lasts
-            ends |= dict.fromkeys(_LASTING if is_silence else (event.kind,), event.time_s)
+            ends |= dict.fromkeys(_LASTING_KINDS if is_silence else (event.kind,), event.time_s)
             plain.append({**each, "before": True} if old else each)
         return {"events": plain[::-1]}
 
@@ -252,4 +252,4 @@ class Events:
 def _goes(kind: Kind) -> int:
     """Return the place of a kind in the order in which events are removed: what an operator is asked for
     afterwards goes last."""
-    return 0 if kind == "tree" else 2 if kind in _LASTING else 1
+    return 0 if kind == "tree" else 2 if kind in _LASTING_KINDS else 1

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.batch.map_frame import write_map_frame
-from app.batch.run_edits import measured_by_people, measured_text, reviews_of
+from app.batch.run_edits import by_people_text, measured_by_people, reviews_of
 from app.batch.run_folder import as_written, recorded_time, score_map
 from app.batch.summary import far_truth, left_out_warning, unconfirmed_warning
 from app.common.text import changed_values, version
@@ -129,12 +129,12 @@ class ShownRun:
         trees = self.shown.frame.trees
         return trees.number[trees.confirmed].tolist(), trees.position[trees.confirmed]
 
-    def _measured(self) -> dict[str, str]:
-        """Return the text of by_people.csv by its name; {} if nobody measured a tree."""
+    def _by_people(self) -> dict[str, str]:
+        """Return a dict from the name by_people.csv to its text; an empty dict without rows."""
         numbers, position = self._numbered()
         x, y = self.offset[:2]
         contents = [replace(row.content, x=row.content.x + x, y=row.content.y + y) for row in self.edits]
-        text = measured_text(numbers, position + np.array([x, y]), contents)
+        text = by_people_text(numbers, position + np.array([x, y]), contents)
         return {BY_PEOPLE: self._in_units(text)} if text else {}
 
     def trees_text(self) -> str:
@@ -190,7 +190,7 @@ class ShownRun:
             "trees.csv": self.trees_text(),
             "path.csv": csv_text(PATH_COLUMNS, path_rows(self.path, self.start_ns)),
             **({"seen.csv": self._in_units(seen_text(self._seen_area()))} if with_seen else {}),
-            **self._measured(),
+            **self._by_people(),
             "terrain.csv": self._in_units(csv_text(TERRAIN_COLUMNS, cells)),
             "run.json": json.dumps(self._record(), indent=1) + "\n",
         }

@@ -25,7 +25,7 @@ from tests.benchmarks.tree_manager_folder import perturbed, read_recorded
 #: Errors of the simulated odometry, as in the benchmark `oxford`: fraction of the length of a step,
 #: rad/sqrt(m), rad/m.
 DISTANCE, TURN, BIAS = 0.02, np.radians(0.5), np.radians(0.02)
-SLACK = 0.1  # m; distortion of a map, as in `Localiser`
+SLACK = preset("stems").relocalisation.slack  # m; distortion of a map
 NEAR = 25.0  # m around the nearest true pose of the stored drive, which gives the frame of its map at a place
 
 
