@@ -123,8 +123,8 @@ class Dashboard:
     # --- the run ---------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Show the default run again, without annotations, a selection, a loop or another speed, and with
-        the preset."""
+        """Show the default run again, without annotations of any class, a selection, a loop or another
+        speed, and with the preset."""
         self.open(RUN)
         self.pause()
         self.page.evaluate(RESET)
@@ -313,7 +313,7 @@ def leave_empty(route: Route) -> None:
 NEXT_FRAME = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 # Not on the page of an error, which has no storage.
-FORGET = "() => { try { localStorage.clear(); } catch { /* nothing is stored */ } }"
+FORGET = "() => { try { localStorage.clear(); sessionStorage.clear(); } catch { /* nothing is stored */ } }"
 
 # The scene is drawn ten times a second instead of sixty: it shows the same, and leaves the core to the tests.
 FEW_FRAMES = """if (location.pathname.startsWith('/viser/')) {
@@ -339,8 +339,9 @@ RESET = """async () => {
   await send("POST", "/api/loop", { from_s: null, to_s: null });
   await send("POST", "/api/command", { type: "set_speed", factor: 1 });
   (await import("/static/js/core/live_feed.js")).select(null);
-  const { run, trees, skipped, others } = await (await fetch("/api/annotations")).json();
-  for (const { id, version } of [...trees, ...skipped, ...(others.repair ?? [])])
+  const { run, trees, skipped, frame, others } = await (await fetch("/api/annotations")).json();
+  const known = [...trees, ...skipped, ...(frame ? [frame] : []), ...Object.values(others).flat()];
+  for (const { id, version } of known)
     await send("DELETE", `/api/annotations/${id}`, { run, version, browser: "c".repeat(32), who: "reset" });
 }"""
 
