@@ -90,6 +90,8 @@ class MapScores:
         reach: Maximum distance between the path and an object of the ground truth that counts.
         beyond: Number of trees and other objects of the ground truth that are farther from the path.
         dbh_ratio: Median DBH of the trees of `dbh_count` in the ground truth, divided by that in the map.
+        missed: Positions x, y of the real trees that are not mapped (FR), in the order of the ground truth.
+        false: Numbers of the mapped trees that are no real trees (FA and spurious ones), in ascending order.
     """
 
     TA: Rate
@@ -110,6 +112,8 @@ class MapScores:
     reach: float
     beyond: int = 0
     dbh_ratio: float | None = None
+    missed: tuple[tuple[float, float], ...] = ()
+    false: tuple[int, ...] = ()
 
     @property
     def dbh_factor(self) -> float:
@@ -157,6 +161,7 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
     right = matched & counted
     right[matched] &= is_tree[truth_of[matched]]
     spurious = int(np.count_nonzero(counted & ~matched))
+    missed = ~hit & in_reach & is_tree
     completeness = Rate(_count(hit & in_reach & is_tree), _count(in_reach & is_tree))
     correctness = Rate(_count(right), _count(counted)).rate
     offset = found[right] - position[truth_of[right]]
@@ -168,7 +173,7 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
         TA=completeness,
         TR=Rate(_count(~hit & in_reach & ~is_tree), _count(in_reach & ~is_tree)),
         FA=Rate(_count(hit & in_reach & ~is_tree), _count(in_reach & ~is_tree)),
-        FR=Rate(_count(~hit & in_reach & is_tree), _count(in_reach & is_tree)),
+        FR=Rate(_count(missed), _count(in_reach & is_tree)),
         spurious=spurious,
         completeness=completeness.rate,
         correctness=correctness,
@@ -183,6 +188,8 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
         reach=parameters.reach,
         beyond=_count(counts & ~in_reach),
         dbh_ratio=float(np.median(dbh[1]) / np.median(dbh[0])) if len(dbh_error) else None,
+        missed=tuple((float(x), float(y)) for x, y in position[missed]),
+        false=tuple(sorted(trees.number[confirmed][counted & ~right].tolist())),
     )
 
 

@@ -255,6 +255,7 @@ def unconfirmed_warning(frame: Frame, parameters: Parameters) -> str:
     )
 
 
+_MOST_LISTED = 12  # trees
 LEFT_OUT = 0.1  # share of the scans above which their loss makes the map doubtful
 
 
@@ -372,12 +373,20 @@ def evaluation_lines(e: MapScores, *, whole: bool = False) -> list[str]:
         *([f"not counted: {beyond} farther from the path (evaluation.reach)"] if e.beyond else []),
         f"other objects left out (TR) {rate_text(e.TR)}, mapped as trees (FA) {rate_text(e.FA)}; "
         f"{count(e.spurious, 'spurious tree')}",
+        *([f"missed at x, y [m]: {_listed([f'{x:.1f}, {y:.1f}' for x, y in e.missed])}"] if e.missed else []),
+        *([f"false trees of the map: {_listed([str(number) for number in e.false])}"] if e.false else []),
         f"completeness {_percent(e.completeness)}   correctness {_percent(e.correctness)}   "
         f"F1 {_percent(e.f1)}",
         f"position RMSE {_metres(e.position_rmse)}   DBH RMSE {_metres(e.dbh_rmse)} "
         f"({count(e.dbh_count, 'tree')})   mean pair error {_pair(e.mean_pair_error_percent)}",
         *([f"warning: {doubt}"] if doubt else []),
     ]
+
+
+def _listed(names: list[str]) -> str:
+    """Return the first _MOST_LISTED names as text, and how many more there are."""
+    more = len(names) - _MOST_LISTED
+    return "; ".join(names[:_MOST_LISTED]) + (f"; and {more} more" if more > 0 else "")
 
 
 def truth_in_doubt(e: MapScores) -> str:

@@ -298,11 +298,17 @@ def best_of(means: Sequence[Row], criterion: Criterion) -> int:
         means: One row per set.
         criterion: One of CRITERIA.
     """
-    values = [
-        (value, -m.set_number) for m in means if m.figures and (value := criterion(m.figures)) is not None
-    ]
-    equal = len(values) > 1 and max(values)[0] == min(values)[0]
-    return -max(values)[1] if values and not equal else 0
+    equals = equally_good(means, criterion)
+    known = sum(bool(m.figures) and criterion(m.figures) is not None for m in means)
+    return equals[0] if equals and (known == 1 or len(equals) < known) else 0
+
+
+def equally_good(means: Sequence[Row], criterion: Criterion) -> list[int]:
+    """Return the numbers of all sets with the best value of a criterion, in ascending order; [] if no value
+    is known. Arguments as in `best_of`."""
+    values = {m.set_number: value for m in means if m.figures and (value := criterion(m.figures)) is not None}
+    best = max(values.values(), default=())
+    return [number for number, value in values.items() if value == best]
 
 
 def figure_words(figures: Figures, name: str, scale: float) -> str:
@@ -502,12 +508,15 @@ def _aligned(rows: list[list[str]]) -> list[str]:
 
 
 def _best_lines(comparison: Comparison) -> list[str]:
-    """Return one line per criterion with the best set. For a single set a criterion without a known value has
-    no line."""
+    """Return one line per criterion with the best set and its equals. For a single set a criterion without a
+    known value has no line."""
     lines = []
     for goal, number in comparison.best.items():
         if number:
-            lines.append(f"best {goal}: set {number} ({words_of(comparison.plan.sets[number - 1])})")
+            others = equally_good(comparison.means, CRITERIA[goal])[1:]
+            also = f", equal to {count(len(others), 'other set')}: {', '.join(map(str, others))}"
+            words = words_of(comparison.plan.sets[number - 1])
+            lines.append(f"best {goal}: set {number} ({words}){also if others else ''}")
         elif len(comparison.plan.sets) > 1:
             lines.append(f"best {goal}: none; all sets are equal or unknown")
     return lines

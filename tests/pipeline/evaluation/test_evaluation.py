@@ -91,6 +91,20 @@ def test_a_truth_that_few_trees_match_is_doubted(right, elsewhere, missed, doubt
         assert f"warning: {told}" in evaluation_lines(score)
 
 
+def test_missed_and_false_trees_are_named():
+    found = np.array([[0.0, 0], [10, 0], [20, 0], [70, 0]])
+    truth = truth_trees(np.array([[0.1, 0], [10, 0], [22, 4.26], [60, 0]]), ("tree", "pole", "tree", "tree"))
+    score = evaluate(trees(found), truth, FOREST, np.array([[15.0, 0.0]]))
+    number = trees(found).number.tolist()
+    assert score.missed == ((22.0, 4.26),)
+    assert score.false == (number[1], number[2])
+    lines = evaluation_lines(score)
+    assert "missed at x, y [m]: 22.0, 4.3" in lines
+    assert f"false trees of the map: {number[1]}; {number[2]}" in lines
+    many = evaluation_lines(replace(score, missed=((0.0, 0.0),) * 14))
+    assert "missed at x, y [m]: " + "0.0, 0.0; " * 12 + "and 2 more" in many
+
+
 def test_what_is_beyond_the_reach_is_counted():
     found, kinds = np.array([[0.0, 0.0]]), ("tree", "tree", "pole", "hidden")
     truth = truth_trees(np.array([[0.0, 0], [30, 0], [40, 0], [50, 0]]), kinds)

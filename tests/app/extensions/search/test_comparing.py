@@ -72,6 +72,16 @@ def test_sets_that_are_alike_in_a_goal_have_no_best(comparison):
     assert "best F1: none; all sets are equal or unknown" in told
 
 
+def test_sets_as_good_as_the_best_are_named(comparison):
+    best, other = comparison.means[1], comparison.means[0]
+    means = (replace(best, set_number=1), replace(other, set_number=2), replace(best, set_number=3))
+    told = lines(replace(comparison, means=means, best=dict.fromkeys(comparison.best, 1)))
+    assert any(
+        line.startswith("best F1: set 1") and line.endswith(", equal to 1 other set: 3") for line in told
+    )
+    assert best_of(means, CRITERIA["F1"]) == 1
+
+
 def test_the_tables_hold_every_row(comparison, tmp_path):
     names = files(comparison, tmp_path / "out")
     assert sorted(names) == sorted(file.name for file in (tmp_path / "out").iterdir())
