@@ -41,6 +41,15 @@ def test_the_story_of_a_selected_tree_is_updated_while_the_run_plays(dashboard: 
     expect(panel.locator(".empty")).to_contain_text("Nothing selected")
 
 
+def test_the_needed_share_of_votes_leads_to_its_slider(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    page.locator("#trees tbody tr").nth(3).click()
+    page.locator("#panel-story").get_by_role("button", name="40 %", exact=True).click()
+    expect(page.locator("#tab-tune")).to_have_attribute("aria-selected", "true")
+    expect(page.locator("[id='tune-classification.tree_share']")).to_be_focused()
+
+
 def test_the_story_of_a_tree_that_a_person_rejected_says_so(dashboard: Dashboard):
     page = dashboard.page
     dashboard.tab("Trees")

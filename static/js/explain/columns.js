@@ -3,6 +3,7 @@
 import { el, letterOf } from "../core/dom.js";
 import { count, figure, share } from "../core/format.js";
 import { verdictOf } from "../core/verdicts.js";
+import { openParameter } from "../tune/panel.js";
 
 // Name of a feature in the files of forests: what the page calls it, its unit ("%": a share), and an explanation. Those of a range of
 // heights are followed by it: "filled 1.4-2.2 m".
@@ -72,7 +73,7 @@ export function columnFigure(story, title) {
   return el("figure", { "data-gathered": story.verdict },
     el("figcaption", { text: title }),
     ...voteNodes(story.votes),
-    el("p", { class: "note", text: reason(story) }),
+    el("p", { class: "note" }, ...reason(story)),
     story.effects.length ? influence(story.effects) : "");
 }
 
@@ -86,9 +87,11 @@ export function voteNodes(shares) {
 
 function reason(story) {
   const rule = RULES[story.verdict];
-  if (!story.by_votes && rule) return rule(story);
+  if (!story.by_votes && rule) return [rule(story)];
   const verdict = story.verdict === "tree" ? "A tree" : `Not a tree: ${story.verdict}`;
-  return `${verdict}, by the votes of the decision trees; a tree needs ${share(story.tree_share)} of them. ${freeEndText(story.tree_in_free_air)}${clearViewText(story.present, story.present + story.absent)}`;
+  const least = el("button", { class: "link", type: "button", text: share(story.tree_share), title: "Go to the slider Tree threshold", onclick: () => openParameter("classification.tree_share") });
+  return [`${verdict}, by the votes of the decision trees; a tree needs `, least,
+    ` of them. ${freeEndText(story.tree_in_free_air)}${clearViewText(story.present, story.present + story.absent)}`];
 }
 
 export const clearViewText = (present, all) => (all ? `In ${present} of ${count(all, "scan")} with a clear view of this place, something stood here.` : "");
