@@ -19,7 +19,7 @@ import numpy as np
 
 from pipeline.config.stages import Slam
 from pipeline.geometry.gaussian import rows_of
-from pipeline.geometry.pose_arrays import PathCorrection
+from pipeline.geometry.pose_arrays import PathCorrection, composed, inverse
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
@@ -609,6 +609,8 @@ class FastSlam:
             scans = (*scans, shown)
         if graph.keyframes and state.distance - graph.keyframes[-1].distance < spacing:
             return state if scans is state.since_keyframe else replace(state, since_keyframe=scans)
+        if len(graph.keyframes) == 1:
+            graph, scans = self._with_first_views(state, scans)
         keyframe = self._keyframe(state, scans, state.detections - len(detections.cluster))
         return replace(
             state,
@@ -617,6 +619,21 @@ class FastSlam:
             keyframe_covariance=np.zeros((3, 3)),
             since_keyframe=(),
         )
+
+    def _with_first_views(
+        self, state: SlamState, scans: tuple[ScanDetections, ...]
+    ) -> tuple[KeyframeGraph, tuple[ScanDetections, ...]]:
+        """Return the graph whose only keyframe has also the detections of the scans that are nearer to it
+        than to the newest scan, and the other scans. The keyframe fixes the frame of the map, so that the
+        noise of a single scan would move and turn the whole map."""
+        first = state.graph.keyframes[0]
+        near = tuple(s for s in scans if s.distance - first.distance < state.distance - s.distance)
+        shown = np.array([first.scan, *(s.scan for s in near)])
+        T_newest_base = state.genealogy.mean_motion_from(shown, normalised(state.log_weight))
+        T_first_base = composed(np.tile(inverse(T_newest_base[:1]), (len(shown), 1)), T_newest_base)
+        birth, centre, R = combined((first, *near), T_first_base)
+        graph = replace(state.graph, keyframes=(replace(first, birth=birth, centre=centre, R=R),))
+        return graph, scans[len(near) :]
 
     def _keyframe(self, state: SlamState, scans: tuple[ScanDetections, ...], first_birth: int) -> Keyframe:
         """Return the keyframe at the newest scan with the combined detections of `scans` since the last

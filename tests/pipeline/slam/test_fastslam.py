@@ -603,6 +603,25 @@ def test_keyframes_at_multiples_of_a_distance_do_not_depend_on_the_number_of_sca
     np.testing.assert_allclose(due, np.arange(1, 1 + 100.0 / max(step, 10.0)) * max(step, 10.0))
 
 
+def test_the_first_keyframe_has_the_detections_of_the_scans_nearest_to_it():
+    sigma, step = 0.05, FOREST.keyframe_distance / 20
+    error, variance = [], []
+    for seed in range(8):
+        slam, rng = fresh(seed, particles=20), np.random.default_rng(seed)
+        for k in range(21):
+            seen = seen_from(Pose2(k * step), rng=rng, sigma=sigma, reach=20.0)
+            slam.process(k, Pose2(step if k else 0.0), seen, NOTHING_SEEN)
+        first, _ = slam.state.graph.keyframes
+        apart = first.centre[:, None] - TREES
+        nearest = np.argmin(np.hypot(*np.moveaxis(apart, -1, 0)), axis=1)
+        assert sorted(nearest) == list(range(len(TREES))), "each tree once, in the frame of the first scan"
+        error.append(apart[np.arange(len(TREES)), nearest])
+        variance.append(first.R[:, 0])
+    # The first scan and those of the first half of the way, with the errors of their poses.
+    assert np.std(error) < 0.5 * sigma
+    assert np.max(variance) < 0.2 * sigma**2
+
+
 def test_a_loop_between_two_used_scans_has_the_whole_motion(monkeypatch):
     slam = fresh(particles=5, update_distance=5.0)
     for k in range(4):
