@@ -346,9 +346,9 @@ def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, 
     """Return the row of the track with the highest likelihood within REACH of an axis that is not in `taken`;
     -1 for none.
 
-    The likelihood of a track with the distance d is (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2)); of equal ones
-    the lowest row is returned. Hits without the distance would prefer branches near a stem, which are
-    observed earlier and as often.
+    The likelihood of a track with the distance d is (1 + hits) exp(-d^2 / (2 OWN^2)): each detection is of
+    the trunk of the column with a probability that decreases with the distance. Of equal ones the lowest row
+    is returned. Hits without the distance would prefer branches near a stem, which are observed as often.
 
     Args:
         tracks: The tracks.
@@ -364,7 +364,7 @@ def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, 
             dx, dy = x - tracks.x[t, 0], y - tracks.x[t, 1]
             square = dx * dx + dy * dy
             if not taken[t] and square < REACH * REACH:
-                likely = (1.0 + np.log(1.0 + tracks.hits[t])) * np.exp(-0.5 * square / (OWN * OWN))
+                likely = (1.0 + tracks.hits[t]) * np.exp(-0.5 * square / (OWN * OWN))
                 if likely > most or (likely == most and t < best):
                     most, best = likely, t
             t = np.int64(cells.following[t])
