@@ -83,6 +83,21 @@ class FinishedRun:
     of_drive: bool
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ByPeople:
+    """What people measured of a run.
+
+    Attributes:
+        tape: Dict from the number of each tree of the map that was measured by tape to its diameter [m].
+        added: Positions of the trees that people added because the map lacks them, shape (M, 2) [m].
+        added_dbh: Their diameters by tape, shape (M,) [m]; NaN where unknown.
+    """
+
+    tape: dict[int, float]
+    added: Float
+    added_dbh: Float
+
+
 def read_run(folder: FilePath) -> FinishedRun:
     """Return the run in a folder that `stemmap map` wrote: its run.json, path.csv and trees.csv, without the
     trees that a person rejected. The trees have diagonal covariances and are all confirmed; times count from
@@ -151,15 +166,19 @@ def read_terrain(folder: FilePath) -> Float:
     return np.stack([c["x_m"], c["y_m"], c["z_m"]], axis=1)
 
 
-def read_by_people(folder: FilePath) -> dict[str, Float]:
-    """Return the columns of by_people.csv by their names, shape (rows,) each; no rows without this file.
+def read_by_people(folder: FilePath) -> ByPeople:
+    """Return what people measured of a run, from by_people.csv; nothing without this file.
 
     Raises:
         SourceError: The file is damaged.
     """
     if not (folder / BY_PEOPLE).is_file():
-        return {name: np.zeros(0) for name in BY_PEOPLE_COLUMNS}
-    return _columns(folder / BY_PEOPLE, BY_PEOPLE_COLUMNS)
+        return ByPeople({}, np.zeros((0, 2)), np.zeros(0))
+    c = _columns(folder / BY_PEOPLE, BY_PEOPLE_COLUMNS)
+    lacks, dbh = np.isnan(c["of_tree"]), 0.01 * c["dbh_tape_cm"]
+    measured = ~lacks & np.isfinite(dbh)
+    tape = dict(zip(c["of_tree"][measured].astype(int).tolist(), dbh[measured].tolist(), strict=True))
+    return ByPeople(tape, np.stack([c["x_m"], c["y_m"]], axis=1)[lacks], dbh[lacks])
 
 
 #: Earlier times count from the start of a sensor [ns since 1970].
