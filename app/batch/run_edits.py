@@ -135,8 +135,8 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
         yield folder
         return
     run = read_run(folder)  # checks the files
-    edited = contents or run.rejected or {*run.reviews.values()} - {OPEN} or (folder / BY_PEOPLE).is_file()
-    if not edited:
+    reviewed = len(run.rejected.number) or {*run.reviews.values()} - {OPEN}
+    if not (contents or reviewed or (folder / BY_PEOPLE).is_file()):
         yield folder
         return
     offset = run.record["source"].get("offset_m", (0.0, 0.0))

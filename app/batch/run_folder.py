@@ -68,7 +68,7 @@ class FinishedRun:
         trees: The trees that no person rejected.
         reviews: Dict from the number of each tree to the state of its review, not "rejected", see
             `REVIEWS`.
-        rejected: Number of rejected trees.
+        rejected: The trees that a person rejected.
         of_drive: Whether it is the map of a drive; another map has an empty path.
     """
 
@@ -79,7 +79,7 @@ class FinishedRun:
     path: Path
     trees: Trees
     reviews: dict[int, str]
-    rejected: int
+    rejected: Trees
     of_drive: bool
 
 
@@ -114,7 +114,8 @@ def read_run(folder: FilePath) -> FinishedRun:
         raise damaged_record(folder) from None
     columns = _columns(folder / "trees.csv", READ_TREE_COLUMNS)
     states = [REVIEWS[k] for k in np.nan_to_num(columns["review"]).astype(np.int64)]
-    trees = rows_of(_trees(columns), kept := np.array([state != REJECTED for state in states], np.bool_))
+    every, kept = _trees(columns), np.array([state != REJECTED for state in states], np.bool_)
+    trees = rows_of(every, kept)
     return FinishedRun(
         record,
         uri,
@@ -123,7 +124,7 @@ def read_run(folder: FilePath) -> FinishedRun:
         _path(_columns(folder / "path.csv", PATH_COLUMNS)),
         trees,
         dict(zip(trees.number.tolist(), (state for state in states if state != REJECTED), strict=True)),
-        int(np.count_nonzero(~kept)),
+        rows_of(every, ~kept),
         is_of_drive(record),
     )
 
