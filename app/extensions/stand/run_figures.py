@@ -43,9 +43,9 @@ class PeopleCount(NamedTuple):
     """Trees in the observed part of a plot, of at least the minimum diameter or without one: those with a
     diameter by tape, also added ones, those that people added, and those of the map that they rejected."""
 
-    by_tape: int
-    added: int
-    removed: int
+    dbh_by_tape: int
+    trees_added: int
+    trees_removed: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,9 +258,7 @@ PLOT_COLUMNS = (
     "trees_without_dbh",
     "trees_with_height",
     "trees_with_volume",
-    "dbh_by_tape",
-    "trees_added",
-    "trees_removed",
+    *PeopleCount._fields,
     "detection",
     "detection_se",
 )
@@ -332,9 +330,7 @@ def stand_record(result: StandResult) -> dict[str, Any]:
                 "trees_without_dbh": f.without_dbh,
                 "trees_with_height": f.with_height,
                 "trees_with_volume": f.with_volume,
-                "dbh_by_tape": result.by_people[name].by_tape,
-                "trees_added": result.by_people[name].added,
-                "trees_removed": result.by_people[name].removed,
+                **result.by_people[name]._asdict(),
                 "detection": _pair(f.detection),
                 **{key: _pair(value) for key, value in f.values.items()},
                 "classes": [
