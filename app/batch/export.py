@@ -35,7 +35,7 @@ from app.batch.map_frame import (
 from app.batch.run_folder import read_by_people, read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
-from pipeline.io.result_files import ROBOTS_FRAME, geojson
+from pipeline.io.result_files import ROBOTS_FRAME, features_text, point_feature, tree_features
 from pipeline.types.records import Trees
 
 #: Date of all files.
@@ -152,9 +152,7 @@ def read_for_export(folder: FilePath) -> ExportedRun:
     trees, path, terrain = run.trees, run.path, read_terrain(folder)
     ground = heights_at(terrain, trees.position) + frame.z
     unknown = np.full(len(trees.number), np.nan)
-    measured = read_by_people(folder)
-    lacks = np.isnan(measured["of_tree"])
-    tape = dict(zip(measured["of_tree"].tolist(), measured["dbh_tape_cm"].tolist(), strict=True))
+    people = read_by_people(folder)
     values = (
         trees.number,
         100.0 * trees.dbh,
@@ -172,7 +170,7 @@ def read_for_export(folder: FilePath) -> ExportedRun:
         unknown if trees.height_sigma is None else trees.height_sigma,
         unknown if trees.lean is None else np.degrees(trees.lean),
         np.array(list(run.reviews.values()), np.str_),
-        np.array([tape.get(number, math.nan) for number in trees.number.tolist()], np.float64),
+        100.0 * np.array([people.tape.get(number, math.nan) for number in trees.number.tolist()], np.float64),
     )
     digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0, 1)
     columns = {
@@ -181,9 +179,9 @@ def read_for_export(folder: FilePath) -> ExportedRun:
     }
     path_xy = frame.to_crs(np.stack([path.x, path.y], axis=1))
     place = frame.to_crs(trees.position)
-    added = frame.to_crs(np.stack([measured["x_m"], measured["y_m"]], axis=1)[lacks])
+    added_dbh = np.round(100.0 * people.added_dbh, 1)
     return ExportedRun(
-        run.uri, trees, frame, place, columns, path_xy, terrain, added, measured["dbh_tape_cm"][lacks]
+        run.uri, trees, frame, place, columns, path_xy, terrain, frame.to_crs(people.added), added_dbh
     )
 
 
@@ -363,26 +361,14 @@ def trees_geojson(run: ExportedRun) -> str:
     "added" and without a number."""
     lon_lat = reproject(run.place, run.frame.crs, WGS84) if run.frame.crs else None
     reviews = dict(zip(run.columns["tree"].tolist(), run.columns["review"].tolist(), strict=True))
-    text, tape = geojson(run.trees, 0, lon_lat=lon_lat, reviews=reviews), run.columns["dbh_tape_cm"]
-    if not (len(run.added) or np.isfinite(tape).any()):
-        return text
-    collection = json.loads(text)
-    for feature, dbh in zip(collection["features"], tape.tolist(), strict=True):
-        feature["properties"]["dbh_tape_cm"] = dbh if math.isfinite(dbh) else None
+    features = tree_features(run.trees, 0, lon_lat=lon_lat, reviews=reviews)
+    tape = [*run.columns["dbh_tape_cm"].tolist(), *run.added_dbh.tolist()]
     places = reproject(run.added, run.frame.crs, WGS84).round(8) if run.frame.crs else run.added.round(3)
-    collection["features"] += [
-        {
-            "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": place},
-            "properties": {
-                "tree": None,
-                "review": "added",
-                "dbh_tape_cm": dbh if math.isfinite(dbh) else None,
-            },
-        }
-        for place, dbh in zip(places.tolist(), run.added_dbh.tolist(), strict=True)
-    ]
-    return json.dumps(collection, indent=1) + "\n"
+    features += [point_feature(x, y, {"tree": None, "review": "added"}) for x, y in places.tolist()]
+    if len(run.added) or np.isfinite(tape).any():
+        for feature, dbh in zip(features, tape, strict=True):
+            feature["properties"]["dbh_tape_cm"] = dbh if math.isfinite(dbh) else None
+    return features_text(features, None if run.frame.crs else ROBOTS_FRAME)
 
 
 def path_geojson(run: ExportedRun) -> str:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.batch.run_folder import BY_PEOPLE_COLUMNS, crs_unit, read_run
-from app.store.records import FRAME, KINDS, SKIPPED, Content
+from app.batch.run_folder import BY_PEOPLE_COLUMNS, ByPeople, crs_unit, read_run
+from app.store.records import FRAME, KINDS, SKIPPED, Content, as_truth
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import write_texts
@@ -69,41 +69,36 @@ def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Conte
     return found
 
 
-def measured_by_people(
-    numbers: Sequence[int], position: Float, contents: Iterable[Content]
-) -> tuple[dict[int, float], list[Content]]:
-    """Return the diameters by tape [m] by the number of the tree, and the annotations of trees that the map
-    lacks. An annotation belongs to a tree as in `reviews_of`; of several with a diameter the nearest one
-    counts.
+def measured_by_people(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> ByPeople:
+    """Return what people measured. An annotation belongs to a tree as in `reviews_of`; of several with a
+    diameter the nearest one counts. One that belongs to no tree of the map is a tree that the map lacks.
 
     Args:
         numbers, position, contents: See `reviews_of`.
     """
     from scipy.spatial import cKDTree
 
-    trees = [content for content in contents if content.kind == "tree"]
-    if not trees or not len(numbers):
-        return {}, trees
-    distance, row = cKDTree(position).query([(content.x, content.y) for content in trees])
-    tape: dict[int, float] = {}
+    stated = as_truth([content for content in contents if content.kind == "tree"])
+    place, tape = np.stack([stated.x, stated.y], axis=1), dict[int, float]()
+    if not len(place) or not len(numbers):
+        return ByPeople(tape, place, stated.dbh)
+    distance, row = cKDTree(position).query(place)
     for k in np.argsort(-distance, kind="stable").tolist():  # the nearest one comes last
-        dbh = trees[k].dbh
-        if distance[k] < SAME_THING and dbh is not None:
-            tape[numbers[row[k]]] = dbh
-    return tape, [content for k, content in enumerate(trees) if distance[k] >= SAME_THING]
+        if distance[k] < SAME_THING and np.isfinite(stated.dbh[k]):
+            tape[numbers[row[k]]] = float(stated.dbh[k])
+    return ByPeople(tape, place[distance >= SAME_THING], stated.dbh[distance >= SAME_THING])
 
 
-def by_people_text(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> str:
-    """Return the text of by_people.csv, see `measured_by_people`; "" without rows.
+def by_people_text(people: ByPeople, numbers: Sequence[int], position: Float) -> str:
+    """Return the text of by_people.csv; "" without rows.
 
     Args:
-        numbers: See `reviews_of`.
-        position, contents: Trees and annotations in the coordinates of the files.
+        people: What people measured, in the coordinates of the files.
+        numbers, position: Numbers and positions of the trees, see `reviews_of`, in these coordinates.
     """
-    tape, added = measured_by_people(numbers, position, contents)
     places = dict(zip(numbers, position.tolist(), strict=True))
-    rows = [(str(number), *places[number], dbh) for number, dbh in sorted(tape.items())]
-    rows += [("", each.x, each.y, np.nan if each.dbh is None else each.dbh) for each in added]
+    rows = [(str(number), *places[number], dbh) for number, dbh in sorted(people.tape.items())]
+    rows += [("", *place, dbh) for place, dbh in zip(people.added.tolist(), people.added_dbh, strict=True)]
     cells = [
         (name, number_text(x, 3), number_text(y, 3), number_text(100.0 * d, 1)) for name, x, y, d in rows
     ]
@@ -140,8 +135,8 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
         yield folder
         return
     run = read_run(folder)  # checks the files
-    edited = contents or run.rejected or {*run.reviews.values()} - {OPEN} or (folder / BY_PEOPLE).is_file()
-    if not edited:
+    reviewed = len(run.rejected.number) or {*run.reviews.values()} - {OPEN}
+    if not (contents or reviewed or (folder / BY_PEOPLE).is_file()):
         yield folder
         return
     offset = run.record["source"].get("offset_m", (0.0, 0.0))
@@ -162,7 +157,7 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content] | None) -> Iterat
             if (folder / name).is_file():
                 shutil.copy2(folder / name, FilePath(there) / name)  # with its date, which the report states
         written = {"trees.csv": csv_text(TREE_COLUMNS, texts)}
-        if measured := by_people_text(numbers, position, placed):
+        if measured := by_people_text(measured_by_people(numbers, position, placed), numbers, position):
             written[BY_PEOPLE] = measured
         write_texts(FilePath(there), written)
         try:

@@ -68,7 +68,7 @@ class FinishedRun:
         trees: The trees that no person rejected.
         reviews: Dict from the number of each tree to the state of its review, not "rejected", see
             `REVIEWS`.
-        rejected: Number of rejected trees.
+        rejected: The trees that a person rejected.
         of_drive: Whether it is the map of a drive; another map has an empty path.
     """
 
@@ -79,8 +79,23 @@ class FinishedRun:
     path: Path
     trees: Trees
     reviews: dict[int, str]
-    rejected: int
+    rejected: Trees
     of_drive: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ByPeople:
+    """What people measured of a run.
+
+    Attributes:
+        tape: Dict from the number of each tree of the map that was measured by tape to its diameter [m].
+        added: Positions of the trees that people added because the map lacks them, shape (M, 2) [m].
+        added_dbh: Their diameters by tape, shape (M,) [m]; NaN where unknown.
+    """
+
+    tape: dict[int, float]
+    added: Float
+    added_dbh: Float
 
 
 def read_run(folder: FilePath) -> FinishedRun:
@@ -99,7 +114,8 @@ def read_run(folder: FilePath) -> FinishedRun:
         raise damaged_record(folder) from None
     columns = _columns(folder / "trees.csv", READ_TREE_COLUMNS)
     states = [REVIEWS[k] for k in np.nan_to_num(columns["review"]).astype(np.int64)]
-    trees = rows_of(_trees(columns), kept := np.array([state != REJECTED for state in states], np.bool_))
+    every, kept = _trees(columns), np.array([state != REJECTED for state in states], np.bool_)
+    trees = rows_of(every, kept)
     return FinishedRun(
         record,
         uri,
@@ -108,7 +124,7 @@ def read_run(folder: FilePath) -> FinishedRun:
         _path(_columns(folder / "path.csv", PATH_COLUMNS)),
         trees,
         dict(zip(trees.number.tolist(), (state for state in states if state != REJECTED), strict=True)),
-        int(np.count_nonzero(~kept)),
+        rows_of(every, ~kept),
         is_of_drive(record),
     )
 
@@ -151,15 +167,19 @@ def read_terrain(folder: FilePath) -> Float:
     return np.stack([c["x_m"], c["y_m"], c["z_m"]], axis=1)
 
 
-def read_by_people(folder: FilePath) -> dict[str, Float]:
-    """Return the columns of by_people.csv by their names, shape (rows,) each; no rows without this file.
+def read_by_people(folder: FilePath) -> ByPeople:
+    """Return what people measured of a run, from by_people.csv; nothing without this file.
 
     Raises:
         SourceError: The file is damaged.
     """
     if not (folder / BY_PEOPLE).is_file():
-        return {name: np.zeros(0) for name in BY_PEOPLE_COLUMNS}
-    return _columns(folder / BY_PEOPLE, BY_PEOPLE_COLUMNS)
+        return ByPeople({}, np.zeros((0, 2)), np.zeros(0))
+    c = _columns(folder / BY_PEOPLE, BY_PEOPLE_COLUMNS)
+    lacks, dbh = np.isnan(c["of_tree"]), 0.01 * c["dbh_tape_cm"]
+    measured = ~lacks & np.isfinite(dbh)
+    tape = dict(zip(c["of_tree"][measured].astype(int).tolist(), dbh[measured].tolist(), strict=True))
+    return ByPeople(tape, np.stack([c["x_m"], c["y_m"]], axis=1)[lacks], dbh[lacks])
 
 
 #: Earlier times count from the start of a sensor [ns since 1970].

@@ -58,6 +58,6 @@ def reviewed(run: Path) -> Iterator[Path]:
 
     contents = stored_on_page(run, stored_reviews) if run.is_dir() else None
     with reviewed_run(run, contents) as folder:
-        if folder != run and (rejected := read_run(folder).rejected):
+        if folder != run and (rejected := len(read_run(folder).rejected.number)):
             print(f"review: {count(rejected, 'tree')} rejected on the page left out", file=sys.stderr)
         yield folder

@@ -121,7 +121,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "distance_m": float(np.hypot(*np.diff(path_xy, axis=0).T).sum()) if len(path_xy) else 0.0,
         "lost": lost,
         "trees": len(trees),
-        "rejected": run.rejected,
+        "rejected": len(run.rejected.number),
         "preset": str(record.get("preset", ""))[:100],
         "parameters": run.parameters.flat(),
         "scores": _scores(record.get("evaluation")),

@@ -15,7 +15,7 @@ import numpy as np
 
 from app.batch.map_frame import write_map_frame
 from app.batch.run_edits import by_people_text, measured_by_people, reviews_of
-from app.batch.run_folder import as_written, recorded_time, score_map
+from app.batch.run_folder import ByPeople, as_written, recorded_time, score_map
 from app.batch.summary import far_truth, left_out_warning, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
@@ -129,24 +129,27 @@ class ShownRun:
         trees = self.shown.frame.trees
         return trees.number[trees.confirmed].tolist(), trees.position[trees.confirmed]
 
-    def _by_people(self) -> dict[str, str]:
+    def by_people(self) -> ByPeople:
+        """Return what people measured of the confirmed trees, in the frame of the map."""
+        return measured_by_people(*self._numbered(), [row.content for row in self.edits])
+
+    def _by_people_files(self, people: ByPeople) -> dict[str, str]:
         """Return a dict from the name by_people.csv to its text; an empty dict without rows."""
         numbers, position = self._numbered()
-        x, y = self.offset[:2]
-        contents = [replace(row.content, x=row.content.x + x, y=row.content.y + y) for row in self.edits]
-        text = by_people_text(numbers, position + np.array([x, y]), contents)
+        offset = np.array(self.offset[:2])
+        placed = replace(people, added=people.added + offset)
+        text = by_people_text(placed, numbers, position + offset)
         return {BY_PEOPLE: self._in_units(text)} if text else {}
 
-    def trees_text(self) -> str:
+    def trees_text(self, people: ByPeople) -> str:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
         coordinates of the files; where any was measured by tape, with `dbh_tape_cm`; with a reference system
-        also their `easting_m` and `northing_m` in it."""
+        also their `easting_m` and `northing_m` in it. `people` is the result of `by_people`."""
         trees = in_file(self.shown.frame.trees, self.one_step)
         names, rows = TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())
-        tape, _ = measured_by_people(*self._numbered(), [row.content for row in self.edits])
-        if tape:
+        if people.tape:
             names = (*names, "dbh_tape_cm")
-            known = (tape.get(number, math.nan) for number in self._numbered()[0])
+            known = (people.tape.get(number, math.nan) for number in self._numbered()[0])
             rows = [(*row, number_text(100.0 * dbh, 1)) for row, dbh in zip(rows, known, strict=True)]
         if self.frame is not None and self.frame.content.values is not None:
             given = self.frame.content.values["frame"]
@@ -179,7 +182,7 @@ class ShownRun:
         """Return a dict from the names trees.csv, path.csv, seen.csv (only if `with_seen`), by_people.csv (if
         people measured trees), terrain.csv and run.json to the texts of these files. terrain.csv has only its
         header if the newest results have no ground."""
-        ground, offset = self.shown.frame.ground, self.offset
+        ground, offset, people = self.shown.frame.ground, self.offset, self.by_people()
         cells = [] if ground is None else list(terrain_rows(ground))
         if self.one_step is not None:
             cells = [
@@ -187,10 +190,10 @@ class ShownRun:
                 for row in cells
             ]
         return {
-            "trees.csv": self.trees_text(),
+            "trees.csv": self.trees_text(people),
             "path.csv": csv_text(PATH_COLUMNS, path_rows(self.path, self.start_ns)),
             **({"seen.csv": self._in_units(seen_text(self._seen_area()))} if with_seen else {}),
-            **self._by_people(),
+            **self._by_people_files(people),
             "terrain.csv": self._in_units(csv_text(TERRAIN_COLUMNS, cells)),
             "run.json": json.dumps(self._record(), indent=1) + "\n",
         }

@@ -177,7 +177,6 @@ def geojson(
     *,
     frame: Mapping[str, str] | None = None,
     lon_lat: Float | None = None,
-    reviews: Mapping[int, str] | None = None,
 ) -> str:
     """Return the text of a GeoJSON FeatureCollection with the confirmed trees. The properties are named as
     TREE_COLUMNS, with null for unknown values; x and y are the geometry. Positions of confirmed trees must be
@@ -191,8 +190,20 @@ def geojson(
         frame: Description of the coordinates of `trees`; None means ROBOTS_FRAME.
         lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees]; None if unknown. They
             become the geometry, and x and y become properties.
-        reviews: See `tree_rows`.
     """
+    features = tree_features(trees, start_ns, lon_lat=lon_lat)
+    return features_text(features, None if lon_lat is not None else ROBOTS_FRAME if frame is None else frame)
+
+
+def tree_features(
+    trees: Trees,
+    start_ns: int,
+    *,
+    lon_lat: Float | None = None,
+    reviews: Mapping[int, str] | None = None,
+) -> list[dict[str, Any]]:
+    """Return the confirmed trees as GeoJSON features, JSON values; arguments and errors as in `geojson` and
+    `tree_rows`."""
     features = []
     for k, row in enumerate(tree_rows(trees, start_ns, reviews)):
         values = dict(zip(TREE_COLUMNS, row, strict=True))
@@ -204,18 +215,27 @@ def geojson(
             name: None if text == "" else text if name == "review" else json.loads(text)
             for name, text in values.items()
         }
-        features.append(
-            {
-                "type": "Feature",
-                "id": properties["tree"],
-                "geometry": {"type": "Point", "coordinates": [x, y]},
-                "properties": properties,
-            }
-        )
+        features.append({"id": properties["tree"], **point_feature(x, y, properties)})
+    return features
+
+
+def point_feature(x: float, y: float, properties: dict[str, Any]) -> dict[str, Any]:
+    """Return a point as a GeoJSON feature."""
+    geometry = {"type": "Point", "coordinates": [x, y]}
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def features_text(features: Sequence[dict[str, Any]], frame: Mapping[str, Any] | None) -> str:
+    """Return the text of a GeoJSON FeatureCollection.
+
+    Args:
+        features: GeoJSON features, JSON values.
+        frame: Description of their coordinates; None for longitude and latitude (WGS84).
+    """
     collection: dict[str, Any] = {"type": "FeatureCollection"}
-    if lon_lat is None:
-        collection["coordinateFrame"] = dict(ROBOTS_FRAME if frame is None else frame)
-    collection["features"] = features
+    if frame is not None:
+        collection["coordinateFrame"] = dict(frame)
+    collection["features"] = list(features)
     return json.dumps(collection, indent=1) + "\n"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from app.batch.map_frame import WGS84, MapFrame, read_map_frame, reproject
-from app.batch.run_folder import read_run, read_seen_area, read_tree_places
+from app.batch.run_folder import read_run, read_seen_area
 from app.batch.visits import (
     VisitComparison,
     VisitTrees,
@@ -127,14 +127,12 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
         StemmapError: The folder or table cannot be read, or has no trees.
     """
     if path.is_dir():
-        trees = read_run(path).trees
-        recorded = read_seen_area(path)
+        run, recorded = read_run(path), read_seen_area(path)
+        trees = run.trees
         seen = None if recorded is None else within_reach(recorded, Stand())
         sigma = np.sqrt(0.5 * np.trace(trees.covariance, axis1=1, axis2=2))
         found = VisitTrees(trees.number, trees.position, sigma, trees.dbh, trees.dbh_sigma)
-        kept = set(trees.number.tolist())
-        rejected = [place for number, place in read_tree_places(path).items() if number not in kept]
-        visit = Visit(str(path), found, np.reshape(rejected, (-1, 2)), seen, read_map_frame(path))
+        visit = Visit(str(path), found, run.rejected.position, seen, read_map_frame(path))
     else:
         table = read_truth_trees(path, dbh_unit=dbh_unit)
         keep = np.array([kind == "tree" for kind in table.kind], np.bool_)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +54,9 @@ class PlotTrees:
             formula.
         volume_shared: Part of `volume_sigma` by the error that all diameters share [m^3], or None.
         height: Heights [m], NaN where unknown; None if no tree has one.
+        by_tape: Whether a person measured the diameter, so that it has no part of the error that the
+            diameters of the map share; None if no tree is measured so.
+        added: Whether a person added the tree because the map lacks it; None if no tree is.
     """
 
     position: Float
@@ -63,12 +66,24 @@ class PlotTrees:
     volume_sigma: Float | None = None
     volume_shared: Float | None = None
     height: Float | None = None
+    by_tape: Bool | None = None
+    added: Bool | None = None
+
+    @property
+    def of_map(self) -> Bool:
+        """Whether the tree is one of the map, shape (T,)."""
+        return np.ones(len(self.dbh), np.bool_) if self.added is None else ~self.added
+
+    def shared(self, common: float) -> Float:
+        """Return the part of `dbh_sigma` that is one error of all trees, at most `common`, shape (T,) [m]; 0
+        where `dbh_sigma` is unknown."""
+        shared = np.minimum(np.nan_to_num(self.dbh_sigma), common)
+        return shared if self.by_tape is None else np.where(self.by_tape, 0.0, shared)
 
     def where(self, keep: Bool) -> PlotTrees:
         """Return the rows for which `keep`, shape (T,), is true."""
-        optional = (self.volume, self.volume_sigma, self.volume_shared, self.height)
-        kept = (None if column is None else column[keep] for column in optional)
-        return PlotTrees(self.position[keep], self.dbh[keep], self.dbh_sigma[keep], *kept)
+        columns = (getattr(self, field.name) for field in fields(self))
+        return PlotTrees(*(None if column is None else column[keep] for column in columns))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,7 +165,9 @@ def stand_figures(
             index.
         detection: Mean probability of detection in the observed part and its standard error; NaN if unknown.
             With an unknown error or a probability below 1, standard errors of stems, basal area and volume
-            that are below NEGLIGIBLE of the value are NaN: nothing that is known limits them.
+            that are below NEGLIGIBLE of the value are NaN: nothing that is known limits them. It is that of
+            the trees of the map. A tree that a person added is one of those that the map was estimated to
+            lack, and takes the place of one of them.
         parameters: Limits of diameters and classes.
 
     Returns:
@@ -199,6 +216,9 @@ def stand_figures(
     common = parameters.dbh_shared_sigma
     basal, basal_var = _basal_areas(kept, common)
     unsure = _threshold_variance(trees, parameters.dbh_min, common)
+    found = kept.of_map
+    lacking = _lacking(found, p)
+    standing = np.where(found, 1.0 + lacking / max(np.count_nonzero(found), 1), 1.0)
     totals = [
         ("n_ha", np.ones(n), unsure),
         ("g_ha", basal, basal_var + unsure * _least_basal(parameters) ** 2),
@@ -212,9 +232,11 @@ def stand_figures(
         # This figure takes all trees in view as found: where that is not certain, 0 is no error of it.
         values[name] = _scaled(HECTARE / seen, total, se, assumed or p < 1.0)
         if p > 0.0:
-            fit = 0.0 if assumed else total * p_se / p
-            spread = math.sqrt((1.0 - share * p) * squares + variance + fit**2)
-            values[f"{name}_corrected"] = _scaled(HECTARE / (seen * p), total, spread, assumed)
+            of_map = weights[found]
+            fit = 0.0 if assumed else float(of_map.sum()) * p_se / p
+            detected = (1.0 - share * p) * float(np.square(of_map).sum()) + variance + fit**2
+            spread = math.sqrt(detected / p**2 + (1.0 - share) * float(np.square(weights[~found]).sum()))
+            values[f"{name}_corrected"] = _scaled(HECTARE / seen, float(standing @ weights), spread, assumed)
     if _is_unlike(n, len(every) - n, share):
         warnings.append(
             f"the plot has {len(every)} trees, but its observed part leads to {n / share:.0f}: it is not "
@@ -223,13 +245,20 @@ def stand_figures(
         for name, _, _ in totals:
             for each in (name, f"{name}_corrected"):
                 values[each] = Estimate(values[each].value, math.nan)
-    found = share * (p if p > 0.0 else 1.0)
-    values.update(_diameter_figures(kept, found, seen, parameters))
+    known = share * (n / (n + lacking) if n else 1.0)
+    values.update(_diameter_figures(kept, known, seen, parameters))
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _classes(kept, share, seen, parameters, math.isnan(p_se))
     return StandFigures(
         area, seen, n, missing, heights, volumes, Estimate(p, p_se), values, classes, tuple(warnings)
     )
+
+
+def _lacking(found: Bool, p: float) -> float:
+    """Return how many trees are estimated to stand in the observed part besides those that are known, with a
+    probability of detection p; `found` is whether each known tree is one of the map. 0 for an unknown p."""
+    missed = np.count_nonzero(found) * (1.0 / p - 1.0) if p > 0.0 else 0.0
+    return max(missed - np.count_nonzero(~found), 0.0)
 
 
 def _is_unlike(inside: int, outside: int, share: float) -> bool:
@@ -295,7 +324,7 @@ def _basal_areas(trees: PlotTrees, common: float) -> tuple[Float, float]:
         return np.full(len(d), math.nan), math.nan
     basal = 0.25 * math.pi * np.square(d)
     by_dbh = 0.5 * math.pi * d
-    error, shared = by_dbh * sigma, by_dbh * np.minimum(sigma, common)
+    error, shared = by_dbh * sigma, by_dbh * trees.shared(common)
     mean, missing = float(basal[known].mean()), int(np.count_nonzero(~known))
     spread = float(basal[known].var(ddof=1)) if known.sum() > 1 else mean**2
     # The mean that a tree without a diameter has contains the shared error, too.
@@ -334,12 +363,11 @@ def _threshold_variance(trees: PlotTrees, least: float, common: float) -> float:
     from scipy.stats import norm
 
     known = np.isfinite(trees.dbh) & (trees.dbh_sigma > 0.0)
-    sigma = trees.dbh_sigma[known]
+    sigma, shared = trees.dbh_sigma[known], trees.shared(common)[known]
     above = np.clip((trees.dbh[known] - least) / sigma, -FAR, FAR)
     p = norm.cdf(above)
     # Change of the expected number by the shared error.
-    shared = norm.pdf(above) * np.minimum(sigma, common) / sigma
-    return _variance_of_sum(np.sqrt(p * (1.0 - p)), shared)
+    return _variance_of_sum(np.sqrt(p * (1.0 - p)), norm.pdf(above) * shared / sigma)
 
 
 def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: Stand) -> dict[str, Estimate]:
@@ -350,7 +378,7 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
     d, sigma = 100.0 * trees.dbh[known], 100.0 * np.nan_to_num(trees.dbh_sigma[known])
     if not len(d):
         return {}
-    shared = np.minimum(sigma, 100.0 * parameters.dbh_shared_sigma)
+    shared = 100.0 * trees.shared(parameters.dbh_shared_sigma)[known]
     thickest = min(parameters.dominant_per_ha * seen / HECTARE, float(len(d)))
     stems = HECTARE * len(trees.dbh) / seen
 

@@ -64,6 +64,9 @@ PLOT_FIELDS = (
     Field("trees_with_dbh", "trees_dbh", "", "number of these trees with a diameter"),
     Field("trees_with_height", "trees_h", "", "number of these trees with a height"),
     Field("trees_with_volume", "trees_v", "", "number of these trees with a volume; empty without a formula"),
+    Field("dbh_by_tape", "tape", "", "number of these trees with a diameter by tape"),
+    Field("trees_added", "trees_add", "", "number of these trees that people added"),
+    Field("trees_removed", "trees_rem", "", "number of trees of the map there that people rejected"),
     *_figure_fields(),
 )
 #: Fields of each layer.
@@ -108,6 +111,7 @@ def read_with_plots(folder: FilePath, of_plots: StandResult | None) -> PlottedRu
                 "trees_with_dbh": f.trees - f.without_dbh,
                 "trees_with_height": f.with_height,
                 "trees_with_volume": math.nan if f.with_volume is None else f.with_volume,
+                **of_plots.by_people[plot.name]._asdict(),
             }
             for name, estimate in f.values.items():
                 figures.update({name: estimate.value, f"{name}_se": estimate.se})

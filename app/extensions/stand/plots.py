@@ -281,9 +281,10 @@ def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | No
 
 
 def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> DetectionFunction:
-    """Return the probability of detection over distance, fitted to all trees in cells of known distance, of
-    at least the minimum diameter or without one. It is 1 if the parameter `correction` is "none", if no
-    distance is known, or if there are fewer than LEAST_TREES such trees.
+    """Return the probability of detection over distance, fitted to all trees of the map in cells of known
+    distance, of at least the minimum diameter or without one. It is 1 if the parameter `correction` is
+    "none", if no distance is known, or if there are fewer than LEAST_TREES such trees. Trees that a person
+    added were not detected.
 
     The cells are not limited to the hull of the trees: trees that are missed far from the path shrink it, so
     that the decrease would vanish from the fit.
@@ -293,7 +294,7 @@ def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> D
     known = seen.where(np.isfinite(seen.nearest))
     if not len(known.nearest):
         return _assumed("whole_cloud")
-    rows = known.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
+    rows = known.rows(trees.position[trees.of_map & ~(trees.dbh < parameters.dbh_min)])
     return fit_half_normal(known.nearest[rows[rows >= 0]], known.nearest) or _assumed("few_trees")
 
 
@@ -310,7 +311,7 @@ def figures_of(
 
     Args:
         plots: Plots with unique names.
-        trees: All trees of the map; those in the observed area and the others count separately.
+        trees: All trees; those in the observed area and the others count separately.
         seen: Cells that count as observed (`within_reach`).
         parameters: Limits, and whether detection is corrected.
     """

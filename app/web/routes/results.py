@@ -90,10 +90,10 @@ def trees_table(dashboard: Dash) -> Response:
     coordinates; only the header before the first map."""
     from pipeline.io.result_files import TREE_COLUMNS, csv_text
 
-    is_mapped = dashboard.shown is not None
-    return text_reply(
-        ShownRun.of(dashboard).trees_text() if is_mapped else csv_text(TREE_COLUMNS, []), "trees.csv"
-    )
+    if dashboard.shown is None:
+        return text_reply(csv_text(TREE_COLUMNS, []), "trees.csv")
+    run = ShownRun.of(dashboard)
+    return text_reply(run.trees_text(run.by_people()), "trees.csv")
 
 
 @router.get("/path.csv")

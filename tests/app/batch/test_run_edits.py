@@ -48,8 +48,12 @@ def test_the_nearest_tape_counts_and_what_is_far_from_trees_is_added():
         Content(9.0, 9.0, "pole"),
         far,
     ]
-    assert measured_by_people([1, 2, 3], PLACES, contents) == ({1: 0.22}, [far])
-    assert measured_by_people([], np.zeros((0, 2)), [far]) == ({}, [far])
+    people = measured_by_people([1, 2, 3], PLACES, contents)
+    assert people.tape == {1: 0.22}
+    for each in (people, measured_by_people([], np.zeros((0, 2)), [far])):
+        assert (each.added.tolist(), each.added_dbh.tolist()) == ([[0.0, SAME_THING + 0.01]], [0.4])
+    nothing = measured_by_people([1, 2, 3], PLACES, [])
+    assert (nothing.tape, nothing.added.shape) == ({}, (0, 2))
 
 
 def test_what_people_measured_is_exported_beside_the_map(tmp_path):
@@ -78,7 +82,7 @@ def test_a_rejected_tree_stays_in_the_table_and_counts_nowhere(tmp_path):
         left = read_run(reviewed)
         text = (reviewed / "trees.csv").read_text()
     assert len(left.trees.number) == len(run.trees.number) - 1
-    assert left.rejected == 1
+    assert left.rejected.number.tolist() == [run.trees.number[0]]
     assert run.trees.number[0] not in left.trees.number
     assert [n for n, review in left.reviews.items() if review == "confirmed"] == [run.trees.number[1]]
     assert text.count(",rejected") == 1

@@ -110,6 +110,23 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     expect(rows).to_have_count(0)
 
 
+def test_what_people_measured_is_stated_below_the_figures(person: Dashboard) -> None:
+    tree = person.ask("/api/trees")["trees"][0]
+    signed = {"run": person.ask("/api/annotations")["run"], "browser": "a" * 16, "who": "Ann"}
+    send = (
+        "([path, body]) => fetch(path, { method: 'POST', body: JSON.stringify(body),"
+        " headers: { 'Content-Type': 'application/json' } })"
+    )
+    place = {"x": tree["x"], "y": tree["y"]}
+    person.page.evaluate(send, ["/api/annotations", {**signed, **place, "kind": "tree", "dbh_cm": 44.4}])
+    review = person.page.locator("#plots-review")
+    expect(review).to_have_text(
+        re.compile(r"Review: 1 of .*\(1 confirmed\)\. By people: 1 diameter by tape\.$")
+    )
+    person.page.evaluate(send, ["/api/annotations/undo", {**signed, "subjects": ["tree"]}])
+    expect(review).to_have_text(re.compile(r"Review: 0 of \d+ found trees reviewed\.$"))
+
+
 def test_a_typed_rectangle_is_a_plot(person: Dashboard) -> None:
     page = person.page
     page.get_by_text("Type a plot").click()
@@ -128,6 +145,7 @@ def test_a_typed_rectangle_is_a_plot(person: Dashboard) -> None:
 def test_the_heading_of_the_report_is_typed_once(person: Dashboard) -> None:
     page = person.page
     fields = page.locator("#report-heading input")
+    assert len(set(fields.evaluate_all("all => all.map(({ offsetWidth }) => offsetWidth)"))) == 1
     fields.nth(0).fill("Hohe Warte <3b>")
     fields.nth(0).press("Tab")
     fields.nth(2).fill("Ann")

@@ -21,7 +21,7 @@ import numpy as np
 
 from app.batch.map_frame import MapFrame
 from app.common.text import version
-from app.extensions.stand.figures import FIGURES, Estimate
+from app.extensions.stand.figures import FIGURES, Estimate, PlotTrees
 from app.extensions.stand.gis_files import PlottedRun, read_with_plots
 from app.extensions.stand.heading import Heading
 from app.extensions.stand.parameters import Stand
@@ -159,7 +159,8 @@ def report_page(
         whole=whole,
         infinity=math.inf,
         figures=figures,
-        trees_in_map=len(whole.trees.dbh) + whole.run.rejected,
+        trees_in_map=len(whole.run.trees.number) + len(whole.run.rejected.number),
+        trees_added=len(run.added),
         no_error=any(
             math.isnan(f.values["n_ha"].se) and f.seen > 0.0
             for result in (whole, of_plots)
@@ -170,7 +171,7 @@ def report_page(
         of_plots=of_plots,
         map=stand_map(run, whole, plots, texts, number),
         histogram=histogram(whole, texts, number),
-        trees=tree_rows(run, texts, number),
+        trees=tree_rows(run, whole.trees, texts, number),
         with_heights=bool(np.isfinite(run.columns["height_m"]).any()),
         warnings=[translated(text, texts) for text in warnings],
         messages=record.get("warnings", []),
@@ -274,32 +275,34 @@ def _digits(estimate: Estimate, least: int | None = None) -> int:
     return next((d for d in range(least, 4) if round(estimate.se, d) > 0.0), least)
 
 
-def tree_rows(run: PlottedRun, texts: dict[str, str], number: Numbers) -> list[list[str]]:
+def tree_rows(run: PlottedRun, trees: PlotTrees, texts: dict[str, str], number: Numbers) -> list[list[str]]:
     """Return the trees as cells: number, two coordinates [m], diameter and its sigma [cm], height and its
     sigma [m] if any height is known, observations, coverage [deg], state of the review; a dash for unknown
-    values. Numbers have the decimals of trees.csv, as on the page.
+    values. Numbers have the decimals of trees.csv, as on the page. Trees that people added come last.
 
     Args:
         run: The run, in the coordinates of its files.
+        trees: Its trees with the diameters of the figures, see `counted_trees`.
         texts: Texts of the language.
         number: Format of the language.
     """
     c = run.columns
     heights = ("height_m", "sigma_height_m") if np.isfinite(c["height_m"]).any() else ()
-    return [
-        [
-            str(c["tree"][k]),
-            number(float(run.place[k, 0]), 3),
-            number(float(run.place[k, 1]), 3),
-            number(float(c["dbh_cm"][k]), 1),
-            number(float(c["sigma_dbh_cm"][k]), 1),
-            *(number(float(c[name][k]), 2) for name in heights),
-            str(c["observations"][k]),
-            number(float(c["coverage_deg"][k]), 0),
-            texts[str(c["review"][k])],
-        ]
-        for k in range(len(run.place))
-    ]
+    places = np.concatenate([run.place, run.added])
+    rows = []
+    for k, (x, y) in enumerate(places.tolist()):
+        row = [number(x, 3), number(y, 3)]
+        row += [number(100.0 * float(value), 1) for value in (trees.dbh[k], trees.dbh_sigma[k])]
+        taped = trees.by_tape is not None and trees.by_tape[k]
+        tape = f", {texts['by_tape']}" if taped else ""
+        if k < len(run.place):
+            row = [str(c["tree"][k]), *row, *(number(float(c[name][k]), 2) for name in heights)]
+            row += [str(c["observations"][k]), number(float(c["coverage_deg"][k]), 0)]
+            row.append(texts[str(c["review"][k])] + tape)
+        else:
+            row = [number(None), *row, *[number(None)] * (len(heights) + 2), texts["added"] + tape]
+        rows.append(row)
+    return rows
 
 
 def _step(length: float) -> float:
@@ -331,15 +334,16 @@ def stand_map(
     Returns:
         A dict with `width` and `height`; `seen` and `path`, SVG path data (`path` is "" for a whole cloud);
         `plots`, a list of (name, path data, x and y of the name); `trees`, a list of (x, y, radius, number,
-        whether the diameter is known), where the number is "" if there are more than 400 trees and an unknown
-        diameter is rendered as 15 cm; the scale bar, `bar` (length) and `bar_text`; `scale` as text, such as
-        "1 : 200"; and `up`, the word at the axis that points up.
+        whether the diameter is known), where the number is "" if there are more than 400 trees or a person
+        added the tree, and an unknown diameter is rendered as 15 cm; the scale bar, `bar` (length) and
+        `bar_text`; `scale` as text, such as "1 : 200"; and `up`, the word at the axis that points up.
     """
     import shapely
 
     seen = shapely.transform(whole.plots[0].shape, run.frame.to_crs)
     shapes = [shapely.transform(plot.shape, run.frame.to_crs) for plot in plots]
-    points = [run.place, run.path, np.reshape(seen.bounds, (2, 2))]
+    place = np.concatenate([run.place, run.added])
+    points = [place, run.path, np.reshape(seen.bounds, (2, 2))]
     points += [np.reshape(shape.bounds, (2, 2)) for shape in shapes]
     every = np.concatenate([np.reshape(p, (-1, 2)) for p in points])
     low, high = every.min(axis=0) - 1.0, every.max(axis=0) + 1.0
@@ -365,9 +369,9 @@ def stand_map(
             for ring in (part.exterior, *part.interiors)
         ]
 
-    labelled = len(run.place) <= _LABELS_MAX
-    dbh = np.nan_to_num(run.columns["dbh_cm"], nan=15.0)
-    radius = np.maximum(0.7, 0.005 * dbh * scale)
+    labels = [str(n) if len(run.place) <= _LABELS_MAX else "" for n in run.columns["tree"]]
+    dbh = np.nan_to_num(whole.trees.dbh, nan=0.15)
+    radius = np.maximum(0.7, 0.5 * dbh * scale)
     bar = _step(min(50.0 / scale, 0.3 * size[0]))
     return {
         "width": round(size[0] * scale, 2),
@@ -379,12 +383,12 @@ def stand_map(
             for plot, shape in zip(plots, shapes, strict=True)
         ],
         "trees": [
-            (x, y, r, str(n) if labelled else "", bool(known))
-            for (x, y), r, n, known in zip(
-                paper(run.place).tolist(),
+            (x, y, r, label, known)
+            for (x, y), r, label, known in zip(
+                paper(place).tolist(),
                 radius.tolist(),
-                run.columns["tree"],
-                np.isfinite(run.columns["dbh_cm"]),
+                [*labels, *[""] * len(run.added)],
+                np.isfinite(whole.trees.dbh).tolist(),
                 strict=True,
             )
         ],

@@ -1,6 +1,6 @@
 // The tab Plots: draw, type, import and list plots, with the stand figures of each plot and of all.
 
-import { draft, historyOf, remove, reviewOf, rows as annotations, STATES, treeNumberOf } from "../../annotate/annotations.js";
+import { draft, historyOf, remove, reviewOf, STATES } from "../../annotate/annotations.js";
 import { get } from "../../core/api.js";
 import { inFile, inMap, unitNode } from "../../core/coordinates.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
@@ -92,7 +92,7 @@ function imported() {
 }
 
 function setting(name, label, value, title, type, placeholder = "") {
-  return el("label", { title }, label, el("input", { type, value, title, placeholder, step: "any", min: "0", max: "100", onchange: (event) => { remember(name, event.target.value.trim()); fill(); refresh(); } }));
+  return el("label", { title }, label, el("input", { type, name, value, title, placeholder, step: "any", min: "0", max: "100", onchange: (event) => { remember(name, event.target.value.trim()); fill(); refresh(); } }));
 }
 
 function build() {
@@ -194,9 +194,10 @@ function hint() {
   if (drawing()) return `Drag on the map from ${sketch.kind === "circle" ? "the centre outwards" : "corner to corner"}, or click both ends. Esc ends.${sketch.kind === "circle" ? " Then its radius can be typed in the list." : ""}`;
   if (!state.map) return nothingYet();
   const drawn = plots().length > 0;
-  const { trees_in_map: all, trees_left_out: leftOut = {} } = (drawn ? figures.plots : figures.all) ?? {};
+  const { trees_in_map: found, trees_added: added, trees_left_out: leftOut = {} } = (drawn ? figures.plots : figures.all) ?? {};
+  const all = found + added;
   const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
-  const trees = all === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${all} trees in the map are counted.`}`;
+  const trees = found === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${count(all, "tree")} are counted.`}`;
   if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
   return `Trees of the map at the shown time.${trees} ± is the standard error; trees that the map lacks are not included. For the mean it is the variation between plots.`;
 }
@@ -223,17 +224,24 @@ function correctionText({ detection_sigma_m: sigma, detection_not_estimated: rea
     + `(detection decreases with distance: half-normal, sigma ${figure(sigma)} m). They are too large where the stand is thinner away from the path.`;
 }
 
-// How many found trees a person has reviewed, and what of the annotations counts in the figures.
+// What people changed in the figures, with the name of each plot where there are plots.
+function byPeopleText() {
+  const { plots: own, all } = figures;
+  return Object.entries((own ?? all)?.plots ?? {}).map(([name, of]) => {
+    const words = [[of.dbh_by_tape, "diameter", "by tape"], [of.trees_added, "tree", "added"], [of.trees_removed, "tree", "removed"]];
+    const changes = words.filter(([number]) => number).map(([number, what, how]) => `${count(number, what)} ${how}`).join(", ");
+    return changes && `By people${own ? `, plot ${name}` : ""}: ${changes}.`;
+  }).filter(Boolean).join(" ");
+}
+
+// How many found trees a person has reviewed, and what people changed in the figures.
 function reviewText() {
   const of = Object.fromEntries(STATES.map((name) => [name, 0]));
   for (const tree of trees()) of[reviewOf(tree)] += 1;
   const all = trees().length;
   if (!all) return "";
   const states = STATES.slice(1).filter((name) => of[name]).map((name) => `${of[name]} ${name}`);
-  const references = annotations().some((row) => row.kind === "tree" && (row.dbh_cm !== null || treeNumberOf(row) === null));
-  return [`Review: ${of.confirmed + of.rejected} of ${count(all, "found tree")} reviewed${states.length ? ` (${states.join(", ")})` : ""}.`,
-    of.rejected && "Rejected trees do not count here.",
-    references && "Diameters by tape and trees that the map lacks are references for the scores, and exported files have them; they do not count here."].filter(Boolean).join(" ");
+  return [`Review: ${of.confirmed + of.rejected} of ${count(all, "found tree")} reviewed${states.length ? ` (${states.join(", ")})` : ""}.`, byPeopleText()].filter(Boolean).join(" ");
 }
 
 // Another run begins with empty fields.

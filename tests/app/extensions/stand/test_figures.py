@@ -157,6 +157,66 @@ def test_trees_that_are_not_detected_are_added_with_their_error():
     assert unsure.values["n_ha"] == sure.values["n_ha"]
 
 
+def added_to(trees, dbh):
+    """Trees of a map with those that a person added, in their order."""
+    every = trees_of([*trees.dbh, *dbh])
+    added = np.arange(len(every.dbh)) >= len(trees.dbh)
+    return replace(every, dbh_sigma=np.concatenate([trees.dbh_sigma, np.zeros(len(dbh))]), added=added)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_a_tree_that_a_person_adds_is_one_of_those_that_the_map_lacks(share):
+    """Stands drawn, of which 70 % are found and a share of the others is added: the corrected stems and basal
+    area have no bias, and their errors agree with the spread."""
+    random = np.random.default_rng(8)
+    errors, told = [], []
+    for _ in range(400):
+        d = random.uniform(0.15, 0.45, 100)
+        found, met = random.random(100) < 0.7, random.random(100) < share
+        v = figures(added_to(trees_of(d[found]), d[~found & met]), detection=(0.7, 0.0)).values
+        truth = 10.0 * math.pi / 4 * float(np.square(d).sum())
+        errors.append((v["n_ha_corrected"].value - 1000.0, v["g_ha_corrected"].value - truth))
+        told.append((v["n_ha_corrected"].se, v["g_ha_corrected"].se))
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 3 * np.std(errors, axis=0) / 20)
+    ratio = np.std(errors, axis=0) / np.sqrt(np.mean(np.square(told), axis=0))
+    assert ratio[0] == pytest.approx(1.0, abs=0.12)
+    assert ratio[1] < 1.12  # what a person adds is known, so the error is at most that which is told
+
+
+@given(
+    st.lists(st.floats(0.08, 1.0) | st.just(math.nan), max_size=30),
+    st.lists(st.floats(0.08, 1.0) | st.just(math.nan), max_size=30),
+    st.floats(0.01, 1.0),
+    st.floats(0.05, 1.0),
+)
+def test_an_added_tree_counts_once_and_without_correction(dbh, more, share, p):
+    common: dict[str, Any] = {"seen": 1000.0 * share, "detection": (p, 0.1 * p)}
+    before, after = (
+        figures(trees, **common).values for trees in (trees_of(dbh), added_to(trees_of(dbh), more))
+    )
+    each = 1e4 / common["seen"]
+    assert after["n_ha"].value == pytest.approx(each * (len(dbh) + len(more)))
+    corrected = max(len(dbh) / p, len(dbh) + len(more))
+    assert after["n_ha_corrected"].value == pytest.approx(each * corrected)
+    for name in ("n_ha", "n_ha_corrected"):
+        assert after[name].value >= before[name].value - 1e-6
+        assert not after[name].se < 0.0
+    for name in ("n_ha", "g_ha"):
+        assert not after[f"{name}_corrected"].value < after[name].value * (1.0 - 1e-9)
+
+
+def test_diameters_by_tape_share_no_error():
+    mapped = trees_of([0.3] * 40, 0.005)
+    taped = replace(mapped, by_tape=np.ones(40, np.bool_))
+    limits = Stand(dbh_shared_sigma=0.005)
+    for name in ("mean_dbh_cm", "dg_cm", "g_ha", "sdi"):
+        before, after = (figures(trees, limits=limits).values[name] for trees in (mapped, taped))
+        assert after.value == before.value
+        assert after.se == pytest.approx(before.se / math.sqrt(40))
+    near = [figures(replace(trees, dbh=np.full(40, 0.07)), limits=limits) for trees in (mapped, taped)]
+    assert near[1].values["n_ha"].se < 0.5 * near[0].values["n_ha"].se
+
+
 def test_thin_trees_do_not_count_and_those_without_a_diameter_have_the_mean():
     f = figures(trees_of([0.05, 0.2, 0.2, math.nan] * 3))
     assert (f.trees, f.without_dbh) == (9, 3)

@@ -211,6 +211,11 @@ def test_cells_of_unknown_distance_do_not_change_the_detection():
     both = driven.joined(scanned)
     assert detection_function(trees, both, Stand()) == detection_function(alone, driven, Stand())
     assert math.isfinite(detection_function(trees, both, Stand()).sigma)
+    missed = places[~found]
+    every = np.concatenate([alone.position, missed])
+    added = np.arange(len(every)) >= len(alone.dbh)
+    with_missed = PlotTrees(every, np.full(len(every), 0.2), np.zeros(len(every)), added=added)
+    assert detection_function(with_missed, driven, Stand()) == detection_function(alone, driven, Stand())
     figures = figures_of([rectangle("all", 15, 10, 30, 20)], trees, both, Stand())
     assert figures["all"].values["n_ha"].value == pytest.approx(len(position) / 0.06)
 
