@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -82,8 +82,11 @@ class PlotTrees:
 
     def where(self, keep: Bool) -> PlotTrees:
         """Return the rows for which `keep`, shape (T,), is true."""
-        columns = (getattr(self, field.name) for field in fields(self))
-        return PlotTrees(*(None if column is None else column[keep] for column in columns))
+        kept: dict[str, Any] = {}
+        for each in fields(self):
+            column = getattr(self, each.name)
+            kept[each.name] = None if column is None else column[keep]
+        return PlotTrees(**kept)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +221,7 @@ def stand_figures(
     unsure = _threshold_variance(trees, parameters.dbh_min, common)
     found = kept.of_map
     lacking = _lacking(found, p)
-    standing = np.where(found, 1.0 + lacking / max(np.count_nonzero(found), 1), 1.0)
+    standing = np.where(found, 1.0 + lacking / max(int(found.sum()), 1), 1.0)
     totals = [
         ("n_ha", np.ones(n), unsure),
         ("g_ha", basal, basal_var + unsure * _least_basal(parameters) ** 2),

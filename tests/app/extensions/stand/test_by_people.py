@@ -110,6 +110,8 @@ def test_trees_of_the_figures_do_not_depend_on_the_order_of_what_people_state(ru
     people = ByPeople(tape, place, added)
     counted = counted_trees(trees, people, VOLUME)
     n = len(trees.number)
+    assert counted.by_tape is not None
+    assert counted.volume is not None
     assert len(counted.dbh) == n + 3
     np.testing.assert_array_equal(counted.of_map, np.arange(n + 3) < n)
     expected = [tape.get(k + 1, trees.dbh[k]) for k in range(n)]

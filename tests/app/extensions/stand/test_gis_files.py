@@ -163,7 +163,9 @@ def test_what_people_measured_is_in_every_format(tmp_path, capsys):
     assert list(book["added"].values)[:2] == [("east_m", "north_m", "dbh_tape_cm"), (500002, 5300002, 31)]
     assert "ADDED" in files["dxf"].read_text()
     assert len(json.loads(files["geojson"].read_text())["features"]) == 102
-    assert "100 trees" in stemmap(capsys, "stand", run).out, "the figures are those of the map"
+    figures = stemmap(capsys, "stand", run).out
+    assert "102 trees from 7 cm" in figures
+    assert "by people: 2 diameters by tape, 2 trees added" in figures
 
 
 def test_qgis_finds_a_style_for_each_layer_and_the_file_is_sound(runs, tmp_path, capsys):
