@@ -6,6 +6,7 @@ are imported inside `run`, so that `--help` answers at once.
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import contextlib
 import difflib
@@ -16,7 +17,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import NoReturn
 
 from app.common.text import version
@@ -59,6 +60,7 @@ CODES = (
 _NEGATIVE = re.compile(r"-[\d.][^,]*,")
 
 STOPPED = "stopped; no result was written"
+_AGAIN_S = 0.001  # until a request to stop that came inside of the compiler is made again
 
 
 class _Parser(argparse.ArgumentParser):
@@ -94,32 +96,11 @@ def main(arguments: list[str] | None = None) -> int:
         0 done, 1 failed with a message (also after Ctrl-C; without one if standard output was closed), 2
         wrong usage, 3 done with losses (see stderr).
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    for problem in problems():
-        print(f"stemmap: {problem}", file=sys.stderr)
-    if not words or (words[0] not in commands() and words[0] not in ("-h", "--help", "--version")):
-        words.insert(0, "serve")  # `stemmap run.mcap` is short for `stemmap serve run.mcap`
-    # argparse takes a word such as -5,3,10 for a flag.
-    for k in range(len(words) - 1, 0, -1):
-        if _NEGATIVE.match(words[k]) and words[k - 1].startswith("--") and words[k - 1] != "--":
-            words[k - 1 : k + 1] = [f"{words[k - 1]}={words[k]}"]
     parsed = argparse.Namespace()
     try:
-        parser, known = _build_parser(words[0])
-        _check_command(words)
-        parsed, unknown = parser.parse_known_args(words)
-        if unknown:
-            _refuse(unknown, parsed.command, known[parsed.command])
-        command = importlib.import_module(commands()[parsed.command])
-        parsed.words = tuple(words)
-        with _sigterm_as_ctrl_c():
-            for taker in parsed.takers:
-                if hasattr(taker, "check"):
-                    taker.check(parsed)
-            for taker in parsed.takers:
-                if (code := taker.run(parsed)) is not None:
-                    return int(code)
-            return int(command.run(parsed))
+        with _stopping():
+            _parse(list(sys.argv[1:] if arguments is None else arguments), parsed)
+            return _run(parsed)
     except SystemExit as stop:  # argparse has printed its message
         return int(stop.code or 0)
     except (ParameterError, UsageError) as error:
@@ -142,6 +123,37 @@ def main(arguments: list[str] | None = None) -> int:
         return _complain(
             StemmapError(f"cannot read or write: {error.strerror or error}", where=str(place)), FAILED
         )
+
+
+def _parse(words: list[str], parsed: argparse.Namespace) -> None:
+    """Parse the words of the command line into a namespace. Raises SystemExit or a StemmapError for wrong
+    usage."""
+    for problem in problems():
+        print(f"stemmap: {problem}", file=sys.stderr)
+    if not words or (words[0] not in commands() and words[0] not in ("-h", "--help", "--version")):
+        words.insert(0, "serve")  # `stemmap run.mcap` is short for `stemmap serve run.mcap`
+    # argparse takes a word such as -5,3,10 for a flag.
+    for k in range(len(words) - 1, 0, -1):
+        if _NEGATIVE.match(words[k]) and words[k - 1].startswith("--") and words[k - 1] != "--":
+            words[k - 1 : k + 1] = [f"{words[k - 1]}={words[k]}"]
+    parser, known = _build_parser(words[0])
+    _check_command(words)
+    _, unknown = parser.parse_known_args(words, parsed)
+    if unknown:
+        _refuse(unknown, parsed.command, known[parsed.command])
+    parsed.words = tuple(words)
+
+
+def _run(parsed: argparse.Namespace) -> int:
+    """Run the command, or an extension that takes it over; return the exit code."""
+    command = importlib.import_module(commands()[parsed.command])
+    for taker in parsed.takers:
+        if hasattr(taker, "check"):
+            taker.check(parsed)
+    for taker in parsed.takers:
+        if (code := taker.run(parsed)) is not None:
+            return int(code)
+    return int(command.run(parsed))
 
 
 def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:
@@ -208,17 +220,31 @@ def _check_command(words: list[str]) -> None:
 
 
 @contextlib.contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Treat SIGTERM as Ctrl-C inside the context, so that partial outputs are removed. Outside of the main
-    thread nothing changes."""
+def _stopping() -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM raise KeyboardInterrupt inside the context, so that partial outputs are removed.
+    Outside of the main thread nothing changes, and Ctrl-C stays ignored where it was."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    numbers = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        numbers.append(signal.SIGINT)
+    before = {number: signal.signal(number, _stop) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stop(number: int, frame: FrameType | None) -> None:
+    """Raise KeyboardInterrupt, but not inside of the compiler: Python prints an exception that is raised in a
+    call from its C code and goes on, and an object that was not completed fails when it is deleted."""
+    while frame is not None and not str(frame.f_globals.get("__name__")).startswith("llvmlite.binding"):
+        frame = frame.f_back
+    if frame is None:
+        raise KeyboardInterrupt
+    threading.Timer(_AGAIN_S, _thread.interrupt_main, (number,)).start()
 
 
 def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:

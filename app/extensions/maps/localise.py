@@ -167,7 +167,10 @@ class Changes:
     def lines(self) -> list[str]:
         """The comparison for people."""
         growth = self.found.growth[np.isfinite(self.found.growth)]
-        known = f"{count(len(self.found.shift), 'tree')} of the map seen again, {len(self.missing)} missing, "
+        known = (
+            f"in the whole run: {len(self.found.shift)} of {count(len(self.found.b_of), 'tree')} of the map "
+            f"seen again, {len(self.missing)} missing, "
+        )
         lines = [f"{known}{len(self.new)} new"]
         if len(growth):
             se = f" +- {100.0 * growth.std(ddof=1) / math.sqrt(len(growth)):.2f}" if len(growth) > 1 else ""

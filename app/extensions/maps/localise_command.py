@@ -103,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not keep:
             arguments.out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="stemmap-localise-")))
         outcome, _ = map_to(arguments, None, on_scan)
-        found = localised.localisation
+        found = localised.localiser.end()
         done = None
         if found.T_map_odom is not None:
             done = changes(stored, arguments.stored, arguments.out, found.T_map_odom)

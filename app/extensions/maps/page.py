@@ -43,8 +43,8 @@ class Locating:
 
     def as_plain(self) -> dict[str, Any]:
         """Return the state as a dict of JSON values: `name`; `state`, "idle", "searching", "found",
-        "absent" or "failed"; `text`; and `pose`, the frame of the stored map in that of the open run, [x, y,
-        yaw] [m, m, rad], None unless found."""
+        "not_found", "absent" or "failed"; `text`; and `pose`, the frame of the stored map in that of the open
+        run, [x, y, yaw] [m, m, rad], None unless found."""
         if self.stored is None:
             return {"name": "", "state": "idle", "text": "", "pose": None}
         if self._problem:
@@ -54,7 +54,9 @@ class Locating:
         now = self._run.localisation
         there = None if now.T_map_odom is None else now.T_map_odom.inverse()
         pose = None if there is None else [round(float(value), 5) for value in there.as_array()]
-        return {"name": self.name, "state": now.state.name.lower(), "text": now.text, "pose": pose}
+        state = now.state.name.lower()
+        text = f"{now.text}; play the run again to search more of it" if state == "not_found" else now.text
+        return {"name": self.name, "state": state, "text": text, "pose": pose}
 
     async def begin(self, name: str, folder: Path) -> None:
         """Read a stored map and begin to locate the open run in it, in place of an earlier one.
@@ -110,6 +112,8 @@ class Locating:
                 except Exception as error:
                     _log.exception("the localisation in the map of %s failed", self.name)
                     self._run, self._problem = None, f"the localisation failed: {error}"
+            if self._run is not None and self._dashboard.status.state == "finished":
+                self._run.localiser.end()
             if self._dashboard.run == run and (now := self.as_plain()) != before:
                 before = now
                 self._tell(now)

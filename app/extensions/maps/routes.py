@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -9,19 +11,23 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
+from app.common.settings import Settings
 from app.extensions.maps.page import Locating
 from app.web.responses import Body, json_reply
-from app.web.routes.access import Dash, Deployment, of_app
+from app.web.routes.access import Dash, Deployment, Permitted, checked_uri, of_app
 from app.web.routes.runs import run_folder, whole_run
+from pipeline.io.readers import path_of
 
 router = APIRouter(prefix="/api")
+MOST_FILES = 500
 Located = Annotated[Locating, of_app("locating")]
 
 
 class _Stored(Body):
-    """A stored run by its key, see `run_folder`."""
+    """A stored run by its key, see `run_folder`, or the path of a stored map on the server."""
 
-    run: Annotated[str, Field(min_length=1, max_length=300)]
+    run: Annotated[str, Field(max_length=300)] = ""
+    path: Annotated[str, Field(max_length=4096)] = ""
 
 
 @router.get("/localise")
@@ -35,14 +41,30 @@ async def localise_state(locating: Located) -> Response:
 
 @router.post("/localise")
 async def start_localising(
-    body: _Stored, locating: Located, dashboard: Dash, settings: Deployment
+    body: _Stored, locating: Located, dashboard: Dash, settings: Deployment, permitted: Permitted
 ) -> Response:
-    """POST /api/localise: locate the open run in the map of a stored run, and return the state, with 202. 404
-    for an unknown run, 409 if it has no files or no trees."""
+    """POST /api/localise: locate the open run in a stored map, and return the state, with 202. 403 for a path
+    that the caller may not open, 404 for an unknown run, 409 if it is no stored map or has no trees."""
+    if body.path:
+        place = Path(path_of(checked_uri(body.path, permitted))).expanduser()
+        await locating.begin(place.name, place)
+        return json_reply(locating.as_plain(), 202)
     name = str((await whole_run(body.run, settings, dashboard))["name"])
     async with run_folder(body.run, settings, dashboard) as folder:
         await locating.begin(name, folder)
     return json_reply(locating.as_plain(), 202)
+
+
+@router.get("/localise/files")
+async def list_files(settings: Deployment) -> Response:
+    """GET /api/localise/files: return `files`, the paths of the .stems files directly in the data folders."""
+    return json_reply({"files": await asyncio.to_thread(_files, settings)})
+
+
+def _files(settings: Settings) -> list[str]:
+    """Return the paths of `list_files`, at most MOST_FILES."""
+    found = [str(path) for folder in settings.data_folders for path in sorted(folder.glob("*.stems"))]
+    return found[:MOST_FILES]
 
 
 @router.delete("/localise")

@@ -9,7 +9,7 @@ import numpy as np
 from app.batch.run_folder import read_run, read_terrain
 from app.cli.stored import reviewed
 from app.extensions.maps.localisation import StoredMap
-from app.extensions.maps.localisation.stored_map import LARGEST_FILE
+from app.extensions.maps.localisation.stored_map import A_MAP, LARGEST_FILE
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
 
@@ -19,24 +19,23 @@ def read_stored_map(path: Path) -> StoredMap:
     `stemmap pack`.
 
     Raises:
-        StemmapError: The folder or file cannot be read.
+        StemmapError: The folder or file cannot be read, or is not a stored map.
     """
-    if path.is_dir():
-        with reviewed(path) as folder:
-            trees = read_run(folder).trees
-        terrain = read_terrain(path) if (path / "terrain.csv").is_file() else np.zeros((0, 3))
-        return StoredMap.of(trees, terrain)
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise StemmapError("the file is larger than 64 MB", where=str(path))
-        content = path.read_bytes()
+        is_run, is_folder = (path / "run.json").is_file(), path.is_dir()
+        content = b"" if is_folder or path.stat().st_size > LARGEST_FILE else path.read_bytes()
+    except (FileNotFoundError, ValueError):  # ValueError: the text is no path
+        raise StemmapError("there is no such folder or file", where=str(path), remedy=A_MAP) from None
     except OSError as error:
-        raise StemmapError(
-            f"there is no map: {error.strerror}",
-            where=str(path),
-            remedy="Name a folder that `stemmap map` wrote, or a file of `stemmap pack`",
-        ) from None
-    return StoredMap.of_bytes(content, str(path))
+        raise StemmapError(f"cannot read it: {error.strerror}", where=str(path), remedy=A_MAP) from None
+    if is_folder and not is_run:
+        raise StemmapError("this folder has no mapped run", where=str(path), remedy=A_MAP)
+    if not is_run:
+        return StoredMap.of_bytes(content, str(path))
+    with reviewed(path) as folder:
+        trees = read_run(folder).trees
+    terrain = read_terrain(path) if (path / "terrain.csv").is_file() else np.zeros((0, 3))
+    return StoredMap.of(trees, terrain)
 
 
 def write_stored_map(stored: StoredMap, file: Path) -> int:

@@ -1,4 +1,4 @@
-// The title of a run: the end of its address; for an upload the name of its file.
+// The title of a run: the end of its address, with the number of a simulated drive; for an upload the name of its file.
 
 import { get } from "../core/api.js";
 
@@ -8,12 +8,14 @@ const uploads = new Map(); // titles by address
 
 // `renew` is called when the name of an upload has arrived.
 export function titleOf(uri, renew = () => {}) {
-  const parts = (uri ?? "").split("?")[0].split("/").filter(Boolean);
+  const [place, query] = (uri ?? "").split("?"), parts = place.split("/").filter(Boolean);
   const last = parts.pop() ?? "";
   if (MADE_UP.test(last)) {
     if (!uploads.has(uri)) ask(uri, last, renew);
     return uploads.get(uri);
   }
+  const drive = last.startsWith("sim:") ? Number(new URLSearchParams(query).get("drive")) : 0;
+  if (drive) return `${last}, drive ${drive}`;
   return NUMBER.test(last) && parts.length ? `${parts.pop()}/${last}` : last;
 }
 

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,6 +86,45 @@ def test_a_request_to_stop_that_came_while_kernels_were_loaded_is_one(capsys, mo
             raise SystemError("returned a result with an exception set") from stop
 
     monkeypatch.setattr("app.cli.params.run", ended)
+    stemmap(capsys, "params").refused(1, "stopped")
+
+
+@pytest.mark.parametrize("ask", [signal.SIGINT, signal.SIGTERM])
+def test_a_request_to_stop_that_came_inside_of_the_compiler_is_not_lost(capsys, monkeypatch, ask):
+    import llvmlite.binding as llvm
+
+    written = []
+
+    def compile_one(_arguments):
+        def in_a_call_from_c(_module, _code):
+            signal.raise_signal(ask)
+            written.append("object")
+
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
+        module = llvm.parse_assembly("define i32 @one() { ret i32 1 }")
+        engine = llvm.create_mcjit_compiler(module, llvm.Target.from_default_triple().create_target_machine())
+        engine.set_object_cache(in_a_call_from_c)
+        engine.finalize_object()
+        written.append("kernel")
+        time.sleep(20.0)
+        written.append("result")
+
+    monkeypatch.setattr("app.cli.params.run", compile_one)
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        stemmap(capsys, "params").refused(1, "stopped")
+    finally:
+        signal.signal(signal.SIGINT, inherited)
+    assert written == ["object", "kernel"]
+
+
+@pytest.mark.parametrize("step", ["problems", "_build_parser"])
+def test_a_request_to_stop_before_the_command_runs_is_told_in_a_line(capsys, monkeypatch, step):
+    def stopped(_=None):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"app.cli.{step}", stopped)
     stemmap(capsys, "params").refused(1, "stopped")
 
 

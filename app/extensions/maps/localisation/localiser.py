@@ -62,6 +62,7 @@ class State(Enum):
 
     SEARCHING = "not found yet"
     FOUND = "found"
+    NOT_FOUND = "not found"  # at the end of the run
     ABSENT = "nothing of this map is here"
 
 
@@ -74,11 +75,12 @@ class Localisation:
         T_map_odom: Pose of the local frame in the map; None unless found.
         covariance: Covariance of x, y [m], yaw [rad] of the base in the map, shape (3, 3), relative to the
             stems of the map; zeros unless found.
-        stems, of: Number of stems that agree, and of stems that are where the map has stems.
+        stems, of: Of the stems in view at the last alignment, the number that agree with stems of the map,
+            and of those that are where the map has stems.
         residual: Root mean square distance of the stems that agree [m]; NaN without any.
         height: Height and tilt of the local frame; None if unknown.
         driven: Distance driven [m].
-        found_at: Distance driven when it was found [m]; NaN unless found.
+        found_at: Distance driven when it was last found [m]; NaN if it never was.
         searches: Number of searches.
         withdrawn: Number of fixes that were withdrawn.
         reason: Why the last search found nothing; "" if found or not searched.
@@ -102,9 +104,16 @@ class Localisation:
         """The state for people."""
         if self.state is State.FOUND:
             sigma = math.sqrt(0.5 * (self.covariance[0, 0] + self.covariance[1, 1]))
-            return f"found: {self.stems} of {self.of} stems agree, {sigma:.2f} m"
-        if self.state is State.SEARCHING and self.withdrawn:
+            agree = f"{self.stems} of {self.of} stems in view agree" if self.of else "too few stems in view"
+            return f"found: {agree}, {sigma:.2f} m"
+        if self.state is State.ABSENT:
+            return str(self.state.value)
+        if self.withdrawn:
             return "not found: the stems contradicted the place that was found"
+        if not math.isnan(self.found_at):
+            return f"found at {self.found_at:.0f} m, lost since: {self.reason}"
+        if self.state is State.NOT_FOUND:
+            return f"not found in {self.driven:.0f} m of driving"
         return str(self.state.value)
 
     @property
@@ -178,6 +187,12 @@ class Localiser:
             self._search(self._index, trees, terrain)
         elif driven >= self._next:
             self._track(self._index, trees, terrain)
+        return self.localisation
+
+    def end(self) -> Localisation:
+        """Return the localisation at the end of the run, after which nothing is found any more."""
+        if self.localisation.state is State.SEARCHING:
+            self.localisation = replace(self.localisation, state=State.NOT_FOUND)
         return self.localisation
 
     @property
@@ -304,7 +319,11 @@ class Localiser:
         self._fix, self._searched_stems = None, 0
         before = self.localisation
         self.localisation = Localisation(
-            driven=before.driven, searches=before.searches, withdrawn=withdrawn, reason=reason
+            driven=before.driven,
+            found_at=before.found_at,
+            searches=before.searches,
+            withdrawn=withdrawn,
+            reason=reason,
         )
 
     def _in_view(self, trees: Trees) -> MapStems:

@@ -14,6 +14,9 @@ from pipeline.loop_closure.stem_matching import MapStems, worst_sigma
 from pipeline.types.records import Int, Int32, Trees, UInt16
 
 FORMAT = 1
+_BEGINNING = zlib.compress(b"", 9)[:2]  # of every file
+#: What a stored map is, for errors.
+A_MAP = "Give the folder of a run that `stemmap map` wrote, or a .stems file that `stemmap pack` wrote of it"
 MILLIMETRE = 0.001  # m; step of a position, far below its standard deviation
 # m; side of the terrain cells of a file. The height of the ground varies over it by a few centimetres, and
 # the plane through all cells around the robot averages that.
@@ -101,9 +104,13 @@ class StoredMap:
         """Return the map from the bytes of a file, which is named in errors.
 
         Raises:
-            StemmapError: The bytes are damaged or of another version.
+            StemmapError: The bytes are of another format, damaged or of another version.
         """
-        damaged = StemmapError("the map of stems is damaged", where=where, remedy="Write it again")
+        if not data.startswith(_BEGINNING):
+            raise StemmapError("this file is not a stored map", where=where, remedy=A_MAP)
+        damaged = StemmapError(
+            "the map of stems is damaged", where=where, remedy="Write it again with `stemmap pack`"
+        )
         try:
             unpacker = zlib.decompressobj()
             content = unpacker.decompress(data, LARGEST_FILE)
@@ -114,7 +121,7 @@ class StoredMap:
                 raise StemmapError(
                     f"it has format {tree.get('format')!r}, and this version reads {FORMAT}",
                     where=where,
-                    remedy="Write it again",
+                    remedy="Write it again with `stemmap pack`",
                 )
             p = decode(_Packed, tree, arrays, planes=True)
         except (ValueError, KeyError, TypeError, RuntimeError, zlib.error):

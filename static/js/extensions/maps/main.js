@@ -2,11 +2,13 @@
 
 import { get, post, remove } from "../../core/api.js";
 import { button, byId, el, setText } from "../../core/dom.js";
+import { capital, count } from "../../core/format.js";
 import { receive } from "../../core/live_feed.js";
 import { edits } from "../../core/permissions.js";
 import { attempted } from "../../core/problem.js";
 import { changed, isDrive } from "../../core/store.js";
 import { colours } from "../../core/theme.js";
+import { when } from "../../runs/figures.js";
 import { extend } from "../../shell/extensions.js";
 
 let now = { name: "", state: "idle", text: "", pose: null };
@@ -14,7 +16,7 @@ let stems = [], stemsOf = ""; // [x, y] of the stored map in its frame, and the 
 
 async function show(message) {
   now = message;
-  if (now.state !== "idle" && stemsOf !== now.name) {
+  if (now.state !== "idle" && (stemsOf !== now.name || now.state === "searching")) { // another map may have the same name
     stemsOf = now.name;
     stems = (await attempted(() => get("/api/localise")))?.stems ?? [];
   }
@@ -29,29 +31,50 @@ async function show(message) {
 
 const stop = () => attempted(() => remove("/api/localise"));
 
+// A run of the list with what tells it from others of its name, and why it cannot be chosen.
+function option({ key, name, begun_s, scans, all_scans, trees }) {
+  const share = scans < all_scans ? `, mapped to ${Math.floor((100 * scans) / all_scans)} %` : "";
+  const text = trees === undefined ? name : `${name}, ${trees ? count(trees, "tree") : "no trees"}${share}, ${when(begun_s)}`;
+  return el("option", { value: key, text, disabled: trees === 0 });
+}
+
 async function choose() {
-  const listed = await attempted(() => get("/api/runs"));
+  const listed = await attempted(() => Promise.all([get("/api/runs"), get("/api/localise/files")]));
   if (!listed) return;
-  const rows = [...listed.runs.filter(({ key }) => key !== String(listed.open)), ...listed.folders];
-  const select = el("select", { id: "localise-run" }, ...rows.map(({ key, name }) => el("option", { value: key, text: name })));
+  const [{ runs, folders, open }, { files }] = listed;
+  const options = [...runs.filter(({ key }) => key !== String(open)), ...folders].map(option);
+  const usable = options.some((each) => !each.disabled);
+  const select = el("select", { id: "localise-run" }, ...options);
+  const path = el("input", { id: "localise-path", type: "text", list: "localise-files", maxlength: "4096", autocomplete: "off", spellcheck: "false", placeholder: "/data/out or stand.stems", oninput: () => allow() });
   const problem = el("p", { class: "error", role: "alert", hidden: true });
   const dialog = el("dialog", { id: "localise-dialog", "aria-labelledby": "localise-title" });
-  const locate = async () => {
+  const locate = async (event) => {
+    event.preventDefault();
     try {
-      await post("/api/localise", { run: select.value });
+      await post("/api/localise", path.value.trim() ? { path: path.value.trim() } : { run: select.value });
       dialog.close();
     } catch (refused) {
       problem.hidden = false;
-      setText(problem, refused.message);
+      setText(problem, capital(refused.message));
     }
   };
-  const go = button("localise-go", "Locate", "Search the stems of the open run in this map", locate, "primary");
-  go.disabled = !rows.length;
-  dialog.append(el("h2", { id: "localise-title", text: "Locate in a stored map" }),
-    el("p", { class: "note dim", text: rows.length ? "The robot is searched among the trees of an earlier run; no start pose is needed. That map does not change." : "There is no stored run yet: a run is listed here after this page has mapped it. Maps in folders are for the command: stemmap localise RUN --map DIR" }),
-    el("label", { for: "localise-run", text: "Run with the map" }), select, problem,
-    el("div", { class: "row end" }, button("localise-cancel", "Cancel", "", () => dialog.close(), ""), go));
+  const go = el("button", { id: "localise-go", class: "primary", text: "Locate", title: "Search the stems of the open run in this map" });
+  const allow = () => { // a typed path counts in place of the run
+    const typed = path.value.trim() !== "";
+    select.disabled = typed || !usable;
+    go.disabled = !typed && !usable;
+    problem.hidden = true;
+  };
+  dialog.append(el("form", { onsubmit: locate },
+    el("h2", { id: "localise-title", text: "Locate in a stored map" }),
+    el("p", { class: "note dim", text: "The robot is searched among the trees of an earlier run; no start pose is needed. That map does not change." }),
+    el("label", { for: "localise-run", text: "Run with the map" }), select,
+    el("p", { class: "note dim", text: usable ? "The open run is not listed: its robot is searched in the map of another run." : "No other run has a map yet: the open run is listed here when another run is open." }),
+    el("label", { for: "localise-path", text: "Or a path on the server: the folder of a mapped run, or a .stems file" }), path,
+    el("datalist", { id: "localise-files" }, ...files.map((value) => el("option", { value }))), problem,
+    el("div", { class: "row end" }, button("localise-cancel", "Cancel", "", () => dialog.close(), ""), go)));
   dialog.addEventListener("close", () => dialog.remove());
+  allow();
   document.body.append(dialog);
   dialog.showModal();
 }

@@ -40,10 +40,11 @@ def test_another_drive_is_found_and_the_map_stays(stand, tmp_path, capsys):
     before = contents(stand)
     assert main(["localise", AGAIN, "--map", str(stand), "--out", str(tmp_path)]) == 0
     told = capsys.readouterr().out
-    assert "stems agree" in told
-    assert "seen again" in told
-    assert "the ground here is" in told
     record = json.loads((tmp_path / "localisation.json").read_text(encoding="utf-8"))
+    assert f"{record['stems']} of {record['of']} stems in view agree" in told
+    trees = len(rows(stand / "trees.csv"))
+    assert f"in the whole run: {record['seen_again']} of {trees} trees of the map seen again" in told
+    assert "the ground here is" in told
     assert record["state"] == "found"
     assert record["withdrawn"] == 0
     assert np.hypot(*record["T_map_odom"][:2]) < 0.3  # both drives begin at one place
@@ -66,8 +67,12 @@ def test_another_stand_is_not_found_and_says_so(stand, tmp_path, capsys):
     assert main(["localise", ELSEWHERE, "--map", str(stand), "--out", str(tmp_path)]) == 3
     told = capsys.readouterr().out
     assert "found after" not in told
-    assert "searches" in told or "nothing of this map is here" in told
+    assert "yet" not in told
     record = json.loads((tmp_path / "localisation.json").read_text(encoding="utf-8"))
+    driven = f"not found in {record['driven_m']:.0f} m of driving"
+    final = {"not_found": driven, "absent": "nothing of this map is here"}
+    assert final[record["state"]] == record["text"]
+    assert record["text"] in told.splitlines()
     assert record["T_map_odom"] is None
     assert rows(tmp_path / "poses.csv") == []
     assert not (tmp_path / "trees_in_map.csv").exists()
@@ -81,7 +86,7 @@ def test_a_small_file_gives_the_same_place(stand, tmp_path, capsys):
     assert main(["pack", str(stand), "--out", str(file)]) == 1  # it exists
     capsys.readouterr()
     assert main(["localise", AGAIN, "--map", str(file)]) == 0
-    assert "stems agree" in capsys.readouterr().out
+    assert "stems in view agree" in capsys.readouterr().out
     assert main(["localise", AGAIN, "--map", str(file), "--grow"]) == 1  # it has no state
 
 
@@ -138,8 +143,17 @@ def test_a_map_with_repairs_does_not_grow(stand, tmp_path, capsys):
 
 
 def test_what_is_no_map_is_refused(tmp_path, capsys):
-    assert main(["localise", AGAIN, "--map", str(tmp_path / "none")]) == 1
-    assert "there is no map" in capsys.readouterr().err
     (tmp_path / "file").write_bytes(b"nothing")
-    assert main(["localise", AGAIN, "--map", str(tmp_path / "file")]) == 1
-    assert "damaged" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    large = tmp_path / "large"
+    with large.open("wb") as sparse:
+        sparse.truncate(65 << 20)
+    for name, what in (
+        ("none", "there is no such folder or file"),
+        ("file", "this file is not a stored map"),
+        ("large", "this file is not a stored map"),
+        ("empty", "this folder has no mapped run"),
+    ):
+        assert main(["localise", AGAIN, "--map", str(tmp_path / name)]) == 1
+        what_to_do = "Give the folder of a run that `stemmap map` wrote, or a .stems file that `stemmap pack`"
+        assert capsys.readouterr().err.startswith(f"stemmap: {what} ({tmp_path / name}). {what_to_do}")

@@ -14,6 +14,7 @@ import pytest
 from app.common.settings import Settings
 from app.extensions.maps import page
 from app.extensions.maps.page import Locating
+from app.extensions.maps.stored_map import read_stored_map, write_stored_map
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from tests.app.batch.finished_runs import write_run
@@ -44,7 +45,12 @@ def shown(stamp_ns: int, place: np.ndarray, T_odom_base: Pose2, run: int = 1) ->
 def dashboard() -> Any:
     """A dashboard that has shown nothing yet."""
     parameters = SimpleNamespace(relocalisation=SimpleNamespace(slack=0.1))
-    return SimpleNamespace(run=1, shown=None, parameters=SimpleNamespace(parameters=parameters))
+    return SimpleNamespace(
+        run=1,
+        shown=None,
+        status=SimpleNamespace(state="playing"),
+        parameters=SimpleNamespace(parameters=parameters),
+    )
 
 
 @pytest.fixture
@@ -75,6 +81,19 @@ async def test_it_is_found_told_and_forgotten(folder, monkeypatch):
     await until(lambda: told[-1]["state"] == "found")
     await locating.forget()
     assert told[-1]["state"] == "idle"
+    await locating.close()
+
+
+async def test_at_the_end_of_the_run_it_is_not_searched_any_more(folder, monkeypatch):
+    monkeypatch.setattr(page, "PAUSE_S", 0.01)
+    told: list[dict[str, Any]] = []
+    here = dashboard()
+    locating = Locating(here, told.append)
+    await locating.begin("stand", folder)
+    here.shown = shown(1_000_000_000, np.array([[3.0, 2.0]]), Pose2())
+    here.status.state = "finished"
+    await until(lambda: told[-1]["state"] == "not_found")
+    assert told[-1]["text"] == "not found in 0 m of driving; play the run again to search more of it"
     await locating.close()
 
 
@@ -124,3 +143,30 @@ async def test_routes(folder):
         assert len(got["stems"]) == len(stand(1, side=60.0))
         assert (await client.delete("/api/localise")).json()["state"] == "idle"
         assert (await client.get("/api/localise")).json()["stems"] == []
+
+
+async def test_a_folder_or_a_file_of_the_server_is_a_stored_map(folder, tmp_path_factory):
+    stored, outside = read_stored_map(folder), tmp_path_factory.mktemp("outside")
+    for place in (folder.parent, outside):
+        write_stored_map(stored, place / "stand.stems")
+    (folder.parent / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
+    (folder.parent / "link.stems").symlink_to(outside / "stand.stems")
+    settings = Settings(recordings=folder.parent, files="folders")
+    async with running(settings) as (client, _):
+        client.headers.update(BEARER)
+
+        async def begun(path: Path | str) -> Any:
+            return await client.post("/api/localise", json={"path": str(path)})
+
+        listed = (await client.get("/api/localise/files")).json()["files"]
+        assert listed == [str(folder.parent / name) for name in ("link.stems", "stand.stems")]
+        for path in (folder, folder.parent / "stand.stems", f"file://{folder}"):
+            answer = await begun(path)
+            assert answer.status_code == 202, answer.text
+            assert answer.json()["name"] == Path(path).name
+        for path in (outside / "stand.stems", folder.parent / "link.stems", "\0", "~nobody/map"):
+            assert (await begun(path)).status_code == 403, path
+        for path in (folder.parent / "none", folder.parent / "run.mcap", folder.parent):
+            refused = await begun(path)
+            assert refused.status_code == 409, path
+            assert ".stems" in refused.json()["error"]["remedy"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -35,7 +37,7 @@ def test_a_robot_is_found_and_followed(seed):
     distance, turn = errors(true, got.T_map_odom)
     assert distance < 0.3  # at the origin of odom, far from the stems
     assert turn < 0.01
-    assert got.text.startswith(f"found: {got.stems} of {got.of} stems agree, 0.0")
+    assert got.text.startswith(f"found: {got.stems} of {got.of} stems in view agree, 0.0")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -197,6 +199,8 @@ def test_outside_of_the_map_the_covariance_grows_until_the_robot_is_searched_aga
     assert (np.diff(sigma[left - 1 : lost]) > 0.0).all()
     assert got[lost][1].T_map_odom is None
     assert got[lost][1].reason == "outside of the map"
+    assert got[left][1].text.startswith("found: too few stems in view, 0.")
+    assert re.fullmatch(r"found at \d+ m, lost since: outside of the map", got[lost][1].text)
     assert State.FOUND not in states[lost:50]
     true, last_one = got[-1]
     assert last_one.state is State.FOUND
@@ -208,8 +212,13 @@ def test_a_map_of_few_stems_is_never_said_to_be_elsewhere():
     for few in (1, 3, 6, 12):
         here = stand(3, density=0.08)
         place = np.random.default_rng(few).uniform(0.0, 20.0, (few, 2)) + 500.0
-        _, got = last(Localiser(stored(place)), here, way(3, SIDE), 3)
+        localiser = Localiser(stored(place))
+        _, got = last(localiser, here, way(3, SIDE), 3)
         assert got.state is State.SEARCHING, few
+        assert got.text == "not found yet"
+        end = localiser.end()
+        assert end.state is State.NOT_FOUND
+        assert end.text == f"not found in {end.driven:.0f} m of driving"
 
 
 def test_the_same_input_gives_the_same_fix():

@@ -60,12 +60,18 @@ def test_a_northing_is_not_written_as_another_place():
 def test_a_later_format_is_named():
     content = record_bytes(Later(format=2, name="stand"))
     with pytest.raises(StemmapError, match="has format 2, and this version reads 1"):
-        StoredMap.of_bytes(zlib.compress(content), "file")
+        StoredMap.of_bytes(zlib.compress(content, 9), "file")
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda b: b[:-5], lambda b: b[:0], lambda b: b[::-1], lambda b: b[:40] + b[44:]]
+    "damage", [lambda b: b[:-5], lambda b: b[:2], lambda b: b[:40] + b[44:], lambda b: b[:9] + b[:9:-1]]
 )
 def test_a_damaged_file_is_refused(damage):
-    with pytest.raises(StemmapError):
+    with pytest.raises(StemmapError, match="the map of stems is damaged"):
         StoredMap.of_bytes(damage(example().as_bytes()), "file")
+
+
+@pytest.mark.parametrize("content", [b"", b"x", b"x_m,y_m\n1,2\n", b"\x89MCAP0\r\n", zlib.compress(b"{}", 1)])
+def test_a_file_of_another_format_is_not_called_damaged(content):
+    with pytest.raises(StemmapError, match=r"is not a stored map \(file\)\. Give the folder of a run"):
+        StoredMap.of_bytes(content, "file")
