@@ -34,8 +34,8 @@ from pipeline.seen_area import SeenArea
 from pipeline.types.records import Trees
 
 ALL = "all"
-#: Standard deviation of a diameter that a person measured [m]: 0.3 cm between four people on 319 trees, with
-#: calipers, which differ more between people than tapes (Luoma et al. 2017, Forests 8(2), 38).
+#: Standard deviation of a diameter that a person measured [m]: 0.3 cm between four people on 319 trees, there
+#: with calipers (Luoma et al. 2017, Forests 8(2), 38).
 TAPE_SIGMA = 0.003
 
 
