@@ -153,6 +153,18 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     page.mouse.up()
     person.until_server("/api/annotations", f"it.trees[2].x > {added['x'] + 0.3}")
 
+    # One that is not chosen stays: such a drag moves the map.
+    canvas.press("Escape")
+    moved = rows(person)[-1]
+    at = place_of(person, moved["x"], moved["y"])
+    page.mouse.move(box["x"] + at["x"], box["y"] + at["y"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + at["x"] + 20, box["y"] + at["y"] + 12, steps=4)
+    page.mouse.up()
+    new = place_of(person, moved["x"], moved["y"])
+    assert (new["x"] - at["x"], new["y"] - at["y"]) == (pytest.approx(20, abs=8), pytest.approx(12, abs=8))
+    assert rows(person)[-1] == moved
+
     # DBH and class are typed; what is no number is refused in words.
     line = page.locator("#annotations tbody tr").first
     dbh = line.get_by_label(re.compile("DBH"))
@@ -340,7 +352,7 @@ def test_a_held_key_and_keys_faster_than_a_look_answer_for_no_unseen_tree(person
     for number, (keys, wait, held) in enumerate([(8, 33, True), (2, 0, False), (2, 60, False)], start=1):
         person.card_shown()
         page.evaluate(PRESSES, ["y", keys, wait, held])
-        expect(toast).to_contain_text("Not counted: ")
+        expect(toast).to_contain_text("Not counted (7 times): " if held else "Not counted: ")
         person.until_server("/api/annotations", f"it.trees.length === {number}")
         toast.get_by_role("button").click()
     person.card_shown()
@@ -951,6 +963,7 @@ def test_an_import_says_how_many_trees_of_the_map_it_confirms(person: Dashboard)
     )
     said = "2 trees imported from plot.csv; 1 tree of the map is confirmed by them"
     expect(person.page.locator("#annotate-hint")).to_contain_text(said)
+    expect(person.page.locator("#problem")).to_contain_text(said)
     expect(person.page.locator("#annotate-confirmed")).to_have_text("1 confirmed")
 
 

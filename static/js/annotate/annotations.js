@@ -34,6 +34,8 @@ export const draft = {
   chosen: null, // id of the annotation that the keys act on
   adding: false, // whether the next click on the map adds an annotation
   place: null, // {x, y, on} where it would be placed
+  held: null, // the annotation on which the pointer is pressed
+  moves: false, // whether it was chosen before, so that dragging moves it
   moved: null, // {id, row, x, y} while an annotation is dragged or nudged
   kind: "other", // class of a rejected tree
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
@@ -42,6 +44,7 @@ export const draft = {
   answered: [], // ids of the annotations of the last answers, the newest last
   error: "",
   refused: "", // why the last answer did not count
+  refusals: 0, // answers in a row that did not count for that reason
   undo: {}, // numbers of edits that can be undone, by their subject
   redo: {},
 };
@@ -196,10 +199,11 @@ async function turn(where, word, subjects) {
   if (!done || run !== state.annotations?.run) return;
   const after = edited();
   const parts = Object.keys({ ...after, ...before }).map((name) => [name, differing(before[name] ?? [], after[name] ?? [])]).filter(([, changes]) => changes.length);
-  showNews(`${word}: ${parts.map(([name, changes]) => count(changes.length, name)).join(", ") || "nothing changed"}.`);
   const [[name, [row, ...others]] = ["", []]] = parts;
-  if (name !== "annotation" || others.length) return;
-  const tree = nearest(trees(), (each) => distance(each, row), state.annotations.same_thing_m);
+  const single = name === "annotation" && !others.length && parts.length === 1;
+  const tree = single ? nearest(trees(), (each) => distance(each, row), state.annotations.same_thing_m) : null;
+  const what = parts.map(([each, changes]) => count(changes.length, each)).join(", ") || "nothing changed";
+  showNews(`${word}: ${what}${tree ? ` of tree ${tree.number} (${row.kind})` : ""}.`);
   if (tree) select(tree.number);
 }
 
@@ -301,8 +305,10 @@ async function answerIfSeen(tree, kind) {
   else await answer(tree, kind);
 }
 
+// A reason that is repeated is counted, so that each refused key changes the text.
 function refuse(why) {
-  draft.refused = `Not counted: ${why}.`;
+  draft.refusals = draft.refused.endsWith(`: ${why}.`) ? draft.refusals + 1 : 1;
+  draft.refused = `Not counted${draft.refusals > 1 ? ` (${draft.refusals} times)` : ""}: ${why}.`;
   showNews(draft.refused);
   news();
 }

@@ -2,10 +2,13 @@
 
 import { placeTexts, unitNode } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
+import { fileName } from "../core/download.js";
 import { count, dbhText, figure, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
+import { showNews } from "../core/problem.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
+import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
@@ -62,8 +65,7 @@ function build() {
     el("div", { class: "annotate-files" },
       el("label", {}, "Name ", nameField("annotate-name")),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,
-      el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "Save CSV", title: "Download the annotations as CSV, with the tree numbers of the shown scan" }),
-      el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "Save GeoJSON", title: "Download the annotations as GeoJSON, with the tree numbers of the shown scan" })),
+      truthLink("csv", "CSV"), truthLink("geojson", "GeoJSON")),
     ...ofExtensions("annotateSections"));
 }
 
@@ -81,6 +83,12 @@ function nameField(id) {
   return field;
 }
 
+// A link to the annotations; the file is named after the run at the time of the click.
+function truthLink(suffix, format) {
+  const name = ({ currentTarget }) => { currentTarget.download = fileName(titleOf(state.status?.source), `truth.${suffix}`); };
+  return el("a", { class: "small", href: `/api/annotations.${suffix}`, download: `truth.${suffix}`, text: `Save ${format}`, title: `Download the annotations as ${format}, with the tree numbers of the shown scan`, onclick: name });
+}
+
 async function take(file, unit) {
   if (file.size > LARGEST_TABLE) {
     draft.error = `${file.name} is larger than ${LARGEST_TABLE / 1e6} MB.`;
@@ -90,6 +98,7 @@ async function take(file, unit) {
   const done = await importTable(await file.text(), unit);
   const more = confirmed() - before;
   if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
+  if (done) showNews(imported);
   fill();
 }
 

@@ -41,13 +41,15 @@ export function grab(at, view) {
   const row = annotating() && !draft.adding ? rowAt(at, view) : null;
   if (!row || isBehindTree(row, at, view)) return false;
   settle();
+  draft.moves = draft.chosen === row.id;
   choose(row.id);
   draft.held = row;
   return true;
 }
 
+// Only an annotation that was chosen before moves: a drag that begins at another one pans the map.
 export function drag(at, view, travelled) {
-  if (!draft.held) return false;
+  if (!draft.held || !draft.moves) return false;
   if (travelled > 4) {
     const [x, y] = view.toMap(...at);
     draft.moved = { id: draft.held.id, row: draft.held, x, y };
