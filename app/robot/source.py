@@ -451,7 +451,8 @@ class LiveSource:
             return ""
         since = "" if silence_s is None else f"Nothing heard for {silence_s:.0f} s"
         if self._link.problem:
-            reason = f"{self._link.problem}; it is tried again every second"
+            problem = self._link.problem.rstrip(".")
+            reason = f"{problem}{'' if problem.endswith('?') else '.'} It is tried again every second"
         elif self._choice is None:
             reason = f"{self._link.place}; {self._link.nothing}"
         elif self._there is False:

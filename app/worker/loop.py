@@ -311,8 +311,9 @@ class WorkerLoop:
         live source is opened by its first messages, see `_listen`. Raises SourceError if it cannot be
         read."""
         self._run, self._requested = self._run + 1, command.uri
-        opening = f"Opening {command.uri}"
-        self._put(protocol.Report(protocol.Status(state="starting", detail=opening, source=command.uri)))
+        status = protocol.Status(state="starting", detail=f"Opening {command.uri}", source=command.uri)
+        self._reported = (status, -math.inf)  # what is compiled from now on is waited for by this source
+        self._put(protocol.Report(status))
         opened = self._session.open(command)
         if opened is not None:
             self._send_opened(opened)

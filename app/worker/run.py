@@ -343,7 +343,8 @@ class Run:
                 they are unknown or an earlier map is continued.
 
         Raises:
-            StemmapError: The random forest of the parameters does not exist.
+            StemmapError: The random forest of the parameters does not exist, or a live run would need the
+                points of earlier scans.
         """
         self.cancel_remapping()
         if self._map.parameters.are_all(parameters, NOT_OF_THE_MAP):
@@ -367,10 +368,16 @@ class Run:
     def _whole_remapping(
         self, new_map: RunMap, preview: Generator[None, None, None] | None = None, *, done: int = 0
     ) -> Remapping:
-        """Return a rerun of the scans that a map has not `done` yet, after its preview if there is one."""
+        """Return a rerun of the scans that a map has not `done` yet, after its preview if there is one. If it
+        could not be completed, the map is closed and StemmapError raised."""
         mapper, no_preview = new_map.mapper, (None for _ in ())
         reread, cache = None if self._is_live else self._cursor.again, self._caches.of(mapper.parameters)
         rerun = Rerun(mapper, cache, reread, segment_ahead, done=done)
+        try:
+            rerun.require(self.current + 1)
+        except StemmapError:
+            new_map.close()
+            raise
         return Remapping(rerun, new_map, preview or no_preview)
 
     def _preview_steps(
@@ -443,9 +450,9 @@ class Run:
                 finished = remapping.map_next(self.current)
                 new_map = remapping.finish() if finished else None
         except TreesDifferError:  # the whole run must be mapped again, and its preview is known
+            self.cancel_remapping()
             new_map = self._new_map(self._make_mapper(remapping.rerun.mapper.parameters))
             self._remapping = self._whole_remapping(new_map)
-            remapping.close()
             return None
         except BaseException:  # also a fault of the mapper, which another try would repeat
             self.cancel_remapping()

@@ -18,6 +18,7 @@ from app.batch.summary import driven, health_word, scans_left_out
 from app.batch.tree_pictures import best_views
 from app.common.settings import DEFAULT_BUDGET, RunBudget
 from app.explain import build as stories
+from app.robot.link import LOST_SCANS
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.sources.one_step import OneStepSource
@@ -46,6 +47,7 @@ from pipeline.types.units import SECOND_NS
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
 Pace = Literal["idle", "replay", "hurry", "live"]
 _MOST_WARNINGS = 20
+_NOT_REMAPPED = "the run was not mapped again, its map is as before"
 
 
 class Session:
@@ -385,7 +387,7 @@ class Session:
         try:
             done = run.remap_next()
         except StemmapError as error:
-            self._warn([f"the run was not mapped again, its map is as before: {error}"])
+            self._warn([f"{_NOT_REMAPPED}: {error}"])
             return None
         if done is None:
             return None
@@ -499,9 +501,12 @@ class Session:
         return run.map_again() if changed or run.is_bare else run.frame
 
     def _begin_remapping(self, run: AnyRun) -> None:
-        """Begin to map a run again with the present parameters, see `remap`."""
+        """Begin to map a run again with the present parameters, see `remap`; a warning if it cannot be."""
         revision = self._revision
-        run.remap(self._parameters, lambda trees: self.on_preview(revision, trees))
+        try:
+            run.remap(self._parameters, lambda trees: self.on_preview(revision, trees))
+        except StemmapError as error:
+            self._warn([f"{_NOT_REMAPPED}: {error}"])
 
     def _warn(self, warnings: Iterable[str]) -> None:
         """Add warnings, each once and the newest last; only the last 20 are kept."""
@@ -513,7 +518,7 @@ class Session:
 
 
 def with_robot(status: Status, robot: LiveSource) -> Status:
-    """Return the status with the fields of a live run: namespaces, waiting scans and recording of its robot.
+    """Return the status with the fields of a live run: namespaces, scans and recording of its robot.
     If the run plays or waits and the robot is silent, the state is "waiting", `detail` has the reason, and
     the quality of the last pose gives way to the time without data."""
     # While scans wait the robot is not silent, even if its link had no time to note it during a compilation.
@@ -530,6 +535,8 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
         robot=robot.robot,
         robots=robot.robots,
         scans_behind=robot.scans_waiting,
+        scans_lost=robot.losses.get(LOST_SCANS, 0),
+        silence_s=None if silence_s is None else round(silence_s, 1),
         recording=robot.recording,
         recorded_file=robot.recorded_file,
     )

@@ -217,6 +217,19 @@ class Rerun:
         self.free = scan.free
         return frame
 
+    def require(self, scans: int) -> None:
+        """Check before a rerun of a live run that it can be completed: that the cache has the scans that are
+        left.
+
+        Args:
+            scans: Number of scans of the run.
+
+        Raises:
+            StemmapError: A scan is not in the cache and cannot be read again.
+        """
+        if self._reread is None and not all(n in self._cache for n in range(self.done, scans)):
+            raise _no_points()
+
     def go_back(self, scans: int, state: MapperState) -> None:
         """Return to an earlier state of the mapper, taken after `scans` scans; where the source is needed, it
         is read again from there."""
@@ -240,10 +253,7 @@ class Rerun:
             StemmapError: The run is live, or the source has no such scan.
         """
         if self._reread is None:
-            raise StemmapError(
-                "the scans of a live run cannot be read again, and these parameters need their points",
-                remedy="Open the recording of the run",
-            )
+            raise _no_points()
         is_new = False
         while not is_new:  # a run that goes on has more scans than when reading began
             is_new = self._segmented is None
@@ -255,3 +265,11 @@ class Rerun:
                     return step, scan
             self._segmented = None
         raise StemmapError(f"the source does not give scan {index} again", remedy="Open it again")
+
+
+def _no_points() -> StemmapError:
+    """Return the error for a rerun that needs points of a live run."""
+    return StemmapError(
+        "the scans of a live run cannot be read again, and these parameters need their points",
+        remedy="Open the recording of the run",
+    )

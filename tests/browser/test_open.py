@@ -22,7 +22,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("spring/north stand.mcap", "spring/south stand.mcap", "autumn/plot.laz"):
         file = made / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(b"")
+        file.write_bytes(b"0")
     return made
 
 

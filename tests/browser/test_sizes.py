@@ -33,19 +33,27 @@ WIDER = """() => [...document.querySelectorAll('#side *')].filter(node =>
 LIVE = """async busy => {
   const { state, changed } = await import('/static/js/core/store.js');
   const figures = busy ? { recording: 'recording run.mcap, 1234.5 MB', health: 'lost', trees: 1234,
-    scan_rate_hz: 10, scans_behind: 123, scans_left_out: 1234, mapping_ms: 141.2, distance_m: 12345.6 }
+    scan_rate_hz: 10, scans_behind: 123, scans_left_out: 1357, scans_lost: 123, silence_s: 0.2,
+    mapping_ms: 141.2, distance_m: 12345.6 }
     : { recording: '', health: 'good', trees: 0, scan_rate_hz: 0, scans_behind: 0, scans_left_out: 0,
-    mapping_ms: 0, distance_m: 0 };
+    scans_lost: 0, silence_s: null, mapping_ms: 0, distance_m: 0 };
   state.status = { ...state.status, state: busy ? 'playing' : 'waiting', live: true, robot: 'forwarder-07',
-    robots: [], ...figures };
+    robots: [], source: 'zenoh:tcp/192.168.100.200:7447', ...figures };
+  state.statusAt = performance.now();
   state.evaluation = state.truth = null;
   changed('status');
 }"""
 
 # Nothing that the server sends may come in between.
 SEEN = "async busy => {{ await ({})(busy); return [({})(), ({})(), ({})(), ({})()]; }}"
-WORDS = """() => [document.querySelector('[data-figure=behind] dt').textContent,
+WORDS = """() => [...['dd', 'dt'].map(part => document.querySelector(`[data-figure=data] ${part}`).innerText),
   document.querySelector('#state').title]"""
+
+NAME = """() => {
+  const parts = [...document.querySelectorAll('#source-name, #source-name *')];
+  const isCut = part => part.scrollWidth > part.clientWidth + 1 && part.clientWidth > 0;
+  return [parts[0].textContent, parts.some(isCut)];
+}"""
 
 # Places of the figures in the strip with its height, those that are shown whole, and those whose text is cut.
 STRIP = """() => {
@@ -113,8 +121,10 @@ def test_the_strip_of_a_live_run_is_whole_and_nothing_in_it_moves(mapped: Dashbo
         assert places[0] == places[1], width
         if width == 1440:
             shown = {name for name, _ in places[1][1:]}
-            assert shown == {"trees", "health", "driven", "behind", "mapping", "rate", "sigma"}
-            assert words == ["behind, 1234 left out", "Live forwarder-07"]
+            assert shown == {"trees", "health", "data", "driven", "behind", "mapping", "rate", "sigma"}
+            assert words == ["0.2s old", "link: 123 lost\nmapping: 1234 left out", "Live forwarder-07"]
+        assert "data" in {name for name, _ in places[1][1:]}, width
+        assert page.evaluate(NAME) == ["192.168.100.200:7447", False], width
         if width < 400:
             assert places[1][0] < 0.15 * height
 

@@ -64,10 +64,23 @@ def test_no_dialog_covers_the_stop_of_an_obstacle(dashboard: Dashboard):
 
 
 # A live run that waits for its robot, with a long reason.
-SILENT = """async () => {
+SILENT = """async (for_s) => {
   const { state, changed } = await import('/static/js/core/store.js');
-  const detail = 'Nothing heard for 12 s: robot forwarder-07 is gone; the map goes on when it is back';
-  state.status = { ...state.status, live: true, state: 'waiting', detail, health: 'no data for 12 s' };
+  const detail = `Nothing heard for ${for_s} s: robot forwarder-07 is gone; the map goes on when it is back`;
+  state.status = { ...state.status, live: true, state: 'waiting', detail, health: `no data for ${for_s} s`,
+    silence_s: for_s };
+  state.statusAt = performance.now();
+  changed('status');
+  const way = document.querySelector('#way');
+  return [way.hidden ? '' : way.innerText, way.dataset.zone, document.querySelector('#notice').hidden,
+    ...['.map-frame canvas', '#scene'].map(part => getComputedStyle(document.querySelector(part)).filter)];
+}"""
+# One that waits for its first scan.
+UNHEARD = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const detail = 'Waiting: no connection to tcp/127.0.0.1:7447: no Zenoh router answers there. Is it '
+    + 'running, is the address right, and is the network up? It is tried again every second';
+  state.status = { ...state.status, live: true, state: 'waiting', detail, scan_index: -1 };
   changed('status');
   return document.querySelector('#notice').hidden;
 }"""
@@ -88,14 +101,29 @@ def test_a_notice_covers_no_button(dashboard: Dashboard):
         for width, height in ((1440, 900), (1280, 720), (390, 844), (1260, 720)):
             page.set_viewport_size({"width": width, "height": height})
             dashboard.drawn()
-            assert not page.evaluate(SILENT)
-            assert page.evaluate(COVERED, "#notice") == [], f"{name}, {width} px"
-    page.evaluate(SILENT)
+            assert not page.evaluate(UNHEARD)
+            assert page.evaluate(COVERED, "#notice") in ([], ["notice-open"]), f"{name}, {width} px"
+            page.evaluate(SILENT, 12)
+            assert page.evaluate(COVERED, "#way") == [], f"{name}, {width} px"
+    page.evaluate(REAL_STATUS)
+
+
+def test_a_silence_is_as_loud_as_a_stop_and_the_picture_looks_stale(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    why = "Robot forwarder-07 is gone; the map goes on when it is back"
+    for for_s, zone in ((2, "slow"), (12, "silent")):
+        text, shown, has_no_notice, *filters = page.evaluate(SILENT, for_s)
+        assert (text, shown) == (f"■ No data for {for_s} s\n{why}", zone)
+        assert has_no_notice, "one alarm, not two"
+        assert filters == ["grayscale(1)"] * 2
     health = page.locator("[data-figure=health]")
     expect(health.locator("dd span")).to_have_text("no data")
-    expect(health.locator("dt")).to_have_text("SLAM: for 12 s")
+    expect(health.locator("dt")).to_have_text("for 12 s")
     expect(health).to_have_class("warn")  # and not the quality of the last pose
     page.evaluate(REAL_STATUS)
+    expect(page.locator("#way")).to_be_hidden()
+    dashboard.until("() => getComputedStyle(document.querySelector('#scene')).filter === 'none'")
 
 
 # The last status, as of a live run that has mapped something; later ones do not come in between.

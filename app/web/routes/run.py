@@ -197,7 +197,7 @@ async def inside(body: _Uninspected, permitted: Permitted) -> Response:
 @router.get("/sources")
 async def sources(dashboard: Dash, settings: Deployment) -> Response:
     """GET /api/sources: return an object with `scenarios`, a list of objects with `uri` and `doc`, and
-    `recordings`, a list of at most 500 results of `_listed`."""
+    `recordings`, a list of at most 500 results of `_listed`, without a file that is being written."""
     from pipeline.simulation.scenarios import scenarios
 
     try:
@@ -205,10 +205,12 @@ async def sources(dashboard: Dash, settings: Deployment) -> Response:
     except StemmapError:  # they are listed under their file names then
         uploaded = {}
     found = await asyncio.to_thread(recordings, settings.data_folders)
+    status = dashboard.status
+    written = status.recorded_file if status.recording.startswith(("recording", "finishing")) else ""
     return json_reply(
         {
             "scenarios": [{"uri": uri, "doc": doc} for uri, doc in scenarios().items()],
-            "recordings": [_listed(path, name, uploaded) for path, name in found],
+            "recordings": [_listed(path, name, uploaded) for path, name in found if str(path) != written],
         }
     )
 
@@ -264,14 +266,14 @@ def _entries(folder: Path, levels: int = _LEVELS) -> Iterator[tuple[Path, _Kind]
 def _kind_of(path: Path) -> _Kind:
     """Return "recording" for a file or folder that is a recording by its name or the names in it; "folder"
     for another folder that is no link; "other" for hidden entries, finished runs, links to other folders,
-    other files and entries that cannot be read."""
+    other and empty files, and entries that cannot be read."""
     from pipeline.io.readers import folder_opener, is_recording
 
     with contextlib.suppress(OSError):
         if path.name.startswith(".") or (path / "run.json").is_file():
             return "other"
         if path.is_file():
-            return "recording" if is_recording(path) else "other"
+            return "recording" if path.stat().st_size and is_recording(path) else "other"
         if path.is_dir():
             return "recording" if folder_opener(path) else "other" if path.is_symlink() else "folder"
     return "other"

@@ -9,7 +9,7 @@ let sendMessage = () => false;
 let chosen = null; // {tree, until}: selected here, not yet confirmed by the server
 
 const receivers = {
-  status(message) { state.status = message; },
+  status(message) { Object.assign(state, { status: message, statusAt: performance.now() }); },
   source({ type, ...source }) { state.source = source; },
   map(message) { receiveMap(message); },
   parameters(message) { state.parameters = message; },

@@ -29,6 +29,7 @@ export const state = {
   lostAt: 0,         // when the connection was lost [ms], 0 while it is open
   refused: false,    // whether the server refuses this page
   heardAt: 0,        // when the last message arrived [ms]
+  statusAt: 0,       // when the status arrived [ms]
 };
 
 // --- selectors ---------------------------------------------------------------------------------

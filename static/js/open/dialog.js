@@ -6,8 +6,9 @@ import { capital } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { parametersText } from "../playback/timeline.js";
 import { ofExtensions } from "../shell/extensions.js";
+import { progressOf } from "../shell/status.js";
 import { completion, isListed, listPlaces, nearMisses, sift } from "./places.js";
-import { isLive, recordingOf, showRobot, startRobotForm } from "./robot_form.js";
+import { isLive, recordingOf, rememberRobot, showRobot, startRobotForm } from "./robot_form.js";
 import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
@@ -32,9 +33,10 @@ export async function openSources() {
   }
 }
 
+// Opens the dialog with the form of a robot, filled with the address of the present or the last one.
 export function connectRobot() {
   openSources();
-  showRobot();
+  showRobot(state.status?.source);
 }
 
 // A place of the list is opened, or written into the field if something is chosen for it first.
@@ -74,10 +76,13 @@ export async function ask(uri) {
   left = state.status;
   say("");
   setText(byId("source-open"), "Opening…");
+  showWait(`Checking ${uri}.`);
+  if (isLive(uri)) rememberRobot(uri);
   try {
     await open({ uri, odometry: byId("source-odometry").value, ...(uri === choice()?.address(path()) ? choice().fields() : {}), ...chosenFor(uri), ...recordingOf(uri) });
     if (requested !== uri) return;
     asked = uri;
+    showWait(`Opening ${uri}.`);
     follow(state);
   } catch (error) {
     if (requested === uri) finish(error.message);
@@ -87,6 +92,7 @@ export async function ask(uri) {
 function finish(message) {
   requested = asked = null;
   setText(byId("source-open"), "Open");
+  showWait("");
   if (message) return say(message);
   byId("source-uri").value = "";
   byId("source-robot").open = false;
@@ -96,8 +102,18 @@ function finish(message) {
 
 function follow({ status }) {
   if (asked === null || status === left) return;
+  if (status.source === asked && status.detail) showWait(status.detail, progressOf(status));
   if (status.state === "failed") finish(status.detail || `${asked} could not be opened.`);
   else if (status.source === asked && status.state !== "starting") finish(""); // a whole cloud takes minutes until its first map
+}
+
+// Why the opening takes long; a screen reader does not announce its progress.
+function showWait(text, progress = "") {
+  const line = byId("source-waits");
+  line.hidden = !text;
+  setText(line.firstElementChild, capital(text));
+  setText(line.lastElementChild, progress);
+  sift(requested !== null);
 }
 
 function say(text) {
@@ -110,7 +126,8 @@ function say(text) {
 }
 
 export function startSources() {
-  for (const id of ["source-button", "notice-open"]) byId(id).addEventListener("click", () => openSources());
+  byId("source-button").addEventListener("click", () => openSources());
+  byId("notice-open").addEventListener("click", () => (isLive(state.status.source) ? connectRobot() : openSources()));
   byId("source-close").addEventListener("click", () => finish(""));
   byId("source-form").addEventListener("submit", (event) => {
     event.preventDefault();

@@ -59,8 +59,9 @@ function withOptions(uri) {
   return typed.length ? `${uri}?${new URLSearchParams(typed)}` : uri;
 }
 
-// Shows what has all typed words, with its folders open; everything where nothing is typed.
-export function sift() {
+// Shows what has all typed words, with its folders open; everything where nothing is typed. That nothing has them says nothing of an
+// address that is being opened.
+export function sift(isOpening = false) {
   const words = byId("source-uri").value.trim().toLowerCase().split(/\s+/).filter(Boolean);
   for (const { node, words: own } of entries) node.hidden = !words.every((word) => own.includes(word));
   for (const each of byId("source-list").querySelectorAll("details")) {
@@ -70,7 +71,7 @@ export function sift() {
   }
   const none = byId("source-none");
   if (!none) return;
-  none.hidden = !words.length || entries.some(({ node }) => !node.hidden);
+  none.hidden = isOpening || !words.length || entries.some(({ node }) => !node.hidden);
   setText(none, "Not in this list. Open takes any path or address.");
 }
 

@@ -29,10 +29,32 @@ const fields = () => byId("robot-fields");
 // Whether the run of an address is recorded: {record: true}, or {} if it is not live.
 export const recordingOf = (address) => (isLive(address) && byId("source-record").checked ? { record: true } : {});
 
-export function showRobot() {
+export const rememberRobot = (address) => remember("robot", address);
+
+// Shows the form with the address of a robot, or with the last one that was opened in this browser.
+export function showRobot(address) {
+  const last = isLive(address ?? "") ? address : recall("robot") ?? "";
   byId("source-robot").open = true;
+  fill(last);
   write();
+  if (last && uri() !== last) setUri(last); // it has parts that the form does not have
   fields().querySelector("input").focus();
+}
+
+// Writes the parts of an address into the fields that have a place for them.
+function fill(address) {
+  const [, name, part, query = ""] = /^(zenoh|velodyne):([^?]*)(?:\?(.*))?$/i.exec(address) ?? [];
+  if (!name) return;
+  byId("robot-kind").value = name.toLowerCase();
+  build();
+  const [, host, port] = /^(?:tcp\/)?(.*):(\d+)$/.exec(part) ?? [];
+  const values = { host, port, ...Object.fromEntries(new URLSearchParams(query)) };
+  for (const input of fields().querySelectorAll("input")) input.value = values[input.name] ?? "";
+}
+
+function setUri(address) {
+  byId("source-uri").value = address;
+  byId("source-uri").dispatchEvent(new Event("input"));
 }
 
 function build() {
@@ -42,8 +64,7 @@ function build() {
 
 function write() {
   const values = Object.fromEntries([...fields().querySelectorAll("input")].map(({ name, value }) => [name, value.trim()]));
-  byId("source-uri").value = kind().address(values);
-  byId("source-uri").dispatchEvent(new Event("input"));
+  setUri(kind().address(values));
 }
 
 export function startRobotForm() {

@@ -62,6 +62,7 @@ function show() {
   showSeeking(status);
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(status.speed);
+  speed.disabled = status.live; // a robot has its own
   showWarnings(status.warnings ?? []);
 }
 

@@ -16,7 +16,7 @@ const WORDS = {
 };
 const NO_FIGURES = ["starting", "failed"];
 const TESTED = ["good", "weak", "lost"]; // the pose was tested by trees; else its sigma says nothing
-const OLD_AFTER = 3000; // [ms] without a message while a run plays
+const OLD_AFTER = 3000; // [ms] without a message while a run plays; longer silences of a robot are red
 const LEFT_OUT = 0.1; // share of the scans above which the map is doubtful, as in app/batch/summary.py
 const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans take longer
 
@@ -27,13 +27,14 @@ const FIGURES = {
   points: ["points", "", (s) => [s.one_step ? s.one_step.points.toLocaleString("en") : NONE]],
   health: ["SLAM", "", (s) => health(s)],
   f1: ["F1 of the map", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
+  data: ["age of the data", "s", (s) => dataOf(s)],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 || s.scans_left_out > LEFT_OUT * (s.scans_left_out + s.scan_index + 1) ? "warn" : "", s.scans_left_out ? `behind, ${s.scans_left_out} left out` : "scans behind"]],
+  behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""]],
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`]],
   rate: ["scans mapped", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE]],
   sigma: ["pose sigma", "", (s) => (state.map && TESTED.includes(s.health) ? sigma(state.map.sigma_xy) : [NONE])],
 };
-const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
+const OF_DRIVES = ["health", "data", "rate", "mapping", "behind", "driven", "sigma"];
 const cells = {};
 
 const rejected = () => trees().filter((tree) => reviewOf(tree) === "rejected").length;
@@ -57,6 +58,19 @@ function ofScan() {
   return right === null || right === undefined ? "F1 of the map" : `F1 of the map; this scan: ${right} of ${right + wrong} true`;
 }
 
+// Age of the newest scan of a robot, what the link lost, and what mapping left out.
+function dataOf(s) {
+  const age = ageOf(s), lost = s.scans_lost, leftOut = s.scans_left_out - lost;
+  const isDoubtful = age >= 1 || s.scans_left_out > LEFT_OUT * (s.scans_left_out + s.scan_index + 1);
+  return [age === null ? NONE : age < 10 ? age.toFixed(1) : String(Math.floor(age)), isDoubtful ? "warn" : "", `link: ${lost} lost\nmapping: ${leftOut} left out`, age === null ? "" : "s old"];
+}
+
+// [s] since the newest scan of a robot came; null before the first one, and after the run.
+function ageOf({ silence_s: silence, state: phase }) {
+  if (silence === null || silence === undefined || phase === "finished") return null;
+  return silence + (performance.now() - state.statusAt) / 1000;
+}
+
 // Explanations of the first states.
 const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first scans", static: "SLAM: the sensor has not moved" };
 
@@ -65,11 +79,20 @@ const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first
 const HELD_FOR = 2000; // [ms]
 const NO_DATA = /^no data/; // of a silent robot
 const noData = (since) => `no data for ${seconds(since)} s`;
+
+// A silence of a live run that has mapped something: what is missing, since when [s], and why. Null if there is none.
+function silenceOf(s) {
+  if (!s?.live || s.scan_index < 0 || state.refused || [...NO_FIGURES, "finished"].includes(s.state)) return null;
+  if (!state.connected) return state.lostAt ? { what: "No connection", for_s: seconds(state.lostAt), why: "The page reconnects by itself." } : null;
+  if (isOld()) return { what: "No data", for_s: seconds(state.heardAt), why: "The program sends nothing." };
+  if (!NO_DATA.test(s.health)) return null;
+  return { what: "No data", for_s: Math.floor(ageOf(s) ?? 0), why: capital(s.detail.replace(/^Nothing heard for \d+ s: /, "")) };
+}
 let held = { state: "good", reason: "", source: "", at: -Infinity };
 
 function health({ health: word, state: phase, source }) {
   const silence = state.connected ? (isOld() ? noData(state.heardAt) : NO_DATA.test(word) && word) : state.lostAt && noData(state.lostAt);
-  if (silence) return ["no data", "warn", silence.replace("no data", "SLAM:")];
+  if (silence) return ["no data", "warn", silence.replace("no data ", "")];
   const known = state.map?.health;
   const now = { state: word, reason: known?.state === word ? known.reason : "", source, at: performance.now() };
   const isWorse = TESTED.includes(word) && TESTED.indexOf(held.state) > TESTED.indexOf(word);
@@ -113,12 +136,14 @@ function show() {
   }
   for (const name of OF_DRIVES) cells[name].cell.hidden = !isDrive();
   cells.rate.cell.hidden ||= status.state === "finished";
+  cells.data.cell.hidden ||= !status.live;
   cells.points.cell.hidden = isDrive();
   document.body.classList.toggle("one-step", !isDrive());
   cells.health.cell.title = healthFigures();
   cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has the times of the run.";
   cells.rate.cell.title = "Scans that were mapped in a second, over the last 20 of them";
-  cells.behind.cell.title = "Scans that wait to be mapped. Scans that were lost or skipped are left out of the map";
+  cells.data.cell.title = "Time since the newest scan of the robot came. Link: scans that the network lost. Mapping: scans that came and are not in the map, because mapping was behind or they could not be read";
+  cells.behind.cell.title = "Scans that wait to be mapped";
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
   cells.f1.cell.hidden = (!state.evaluation && !state.truth) || NO_FIGURES.includes(status.state); // a run with ground truth keeps its cell
@@ -128,9 +153,11 @@ function show() {
   document.title = `${title} · stemmap`;
 }
 
-// Of "folder/number" the folder is cut if there is no room: the number identifies the run.
+// Of "folder/number" the folder is cut if there is no room: the number identifies the run. The port of a robot has a line of its own.
 function showName(title) {
-  const name = byId("source-name"), cut = title.lastIndexOf("/");
+  const isAddress = /:\d+$/.test(title);
+  const name = byId("source-name"), cut = title.lastIndexOf(isAddress ? ":" : "/");
+  byId("source-button").classList.toggle("address", isAddress);
   name.classList.toggle("numbered", cut > 0);
   if (cut <= 0) setText(name, title);
   else if (name.textContent !== title) name.replaceChildren(el("span", { text: title.slice(0, cut) }), el("i", { text: title.slice(cut) }));
@@ -160,14 +187,17 @@ function showState() {
   box.title = [box.querySelector("b").textContent, robotsTitle(state.status)].filter(Boolean).join("\n"); // a long name is cut
   showRecording(state.status?.recording ?? "", state.connected);
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
-  const quiet = isOld();
-  byId("figures").classList.toggle("old", quiet);
-  showNotice(quiet);
+  const quiet = isOld(), silence = silenceOf(state.status);
+  byId("figures").classList.toggle("old", quiet || silence !== null);
+  document.body.classList.toggle("stale", silence !== null);
+  showNotice(quiet, silence);
   showWay();
 }
 
 // The file and its size, or why there is none. A press on a recording ends it, another press begins the next one.
 function showRecording(recording, isConnected) {
+  if (/^(recording|finishing)/.test(recordingBefore) && recording.startsWith("recorded")) showNews(`${capital(recording)}: ${state.status.recorded_file}`);
+  if (isConnected) recordingBefore = recording;
   const box = byId("recording"), isOn = isConnected && isRecording(), canBegin = isConnected && canRecord();
   box.hidden = !recording && !canBegin;
   box.disabled = !(isOn || canBegin) || looksOnly();
@@ -180,6 +210,7 @@ function showRecording(recording, isConnected) {
     : [told, isOn ? "Press twice to end the recording, while the run goes on" : canBegin ? `Press to record the messages of the robot from now on${recording ? ", to a new file" : ""}` : ""].filter(Boolean).join("\n");
 }
 
+let recordingBefore = "";
 let isAsking = false; // whether the next press ends the recording
 export const isRecording = () => (state.status?.recording ?? "").startsWith("recording");
 // A live run that is not recorded now, and sends or may send again.
@@ -197,21 +228,22 @@ function isOld() {
   return state.status?.state === "playing" && now - state.heardAt > patience;
 }
 
-// Obstacles ahead of the robot, below the strip so that nothing moves. A screen reader announces changes of the zone, not of
-// the distance.
+// Obstacles ahead of the robot, or a silence of it, below the strip so that nothing moves. A screen reader announces changes of the
+// zone, not of the distance or the duration.
 const way = byId("way");
 const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? Path ahead not visible to the sensor" };
 
 function showWay() {
-  const clearance = state.map?.clearance;
+  const clearance = state.map?.clearance, silence = silenceOf(state.status);
   // Only a robot that drives on has something in its way, and only a scan of now shows it.
   const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld();
-  const text = clearance && !quiet && WAY[clearance.zone];
+  const text = silence ? `■ ${silence.what}` : clearance && !quiet && WAY[clearance.zone];
   way.hidden = !text;
-  way.dataset.zone = clearance?.zone ?? "";
-  const [zone, distance] = way.children;
+  way.dataset.zone = silence ? (silence.for_s > OLD_AFTER / 1000 ? "silent" : "slow") : clearance?.zone ?? "";
+  const [zone, distance, why] = way.children;
   if (text) setText(zone, text);
-  setText(distance, clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
+  setText(distance, silence ? ` for ${silence.for_s} s` : clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
+  setText(why, silence ? silence.why : "");
   // An open dialog covers everything outside of it.
   const place = [...document.querySelectorAll("dialog:modal")].at(-1) ?? document.querySelector(".strip");
   if (way.parentElement !== place) place.append(way);
@@ -235,7 +267,7 @@ function compilingFor({ compiling_since_s: since, compiled, kernels_left: left }
 const roughly = (s) => (s < 90 ? `${10 * Math.max(1, Math.round(s / 10))} s` : `${Math.round(s / 60)} min`);
 
 // The changing part of the notice, which a screen reader does not announce.
-function progressOf(status) {
+export function progressOf(status) {
   if (!state.connected || !status?.detail) return "";
   return compilingFor(status);
 }
@@ -251,10 +283,10 @@ async function askClock() {
   }
 }
 
-function showNotice(quiet) {
+function showNotice(quiet, silence) {
   const notice = byId("notice");
   const status = state.status;
-  const text = state.refused ? refusedText()
+  const text = silence ? "" : state.refused ? refusedText()
     : !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. The last state is shown; the page reconnects by itself.`
     : quiet ? `${capital(noData(state.heardAt))}. The last state is shown.`
@@ -267,7 +299,9 @@ function showNotice(quiet) {
   document.body.classList.toggle("failed", failed);
   setText(notice.querySelector("span"), capital(text));
   setText(byId("notice-progress"), text && text === status?.detail ? progressOf(status) : "");
-  byId("notice-open").hidden = !failed;
+  const isUnheard = Boolean(status?.live) && (failed || (status.state === "waiting" && status.scan_index < 0)); // its address may be wrong
+  byId("notice-open").hidden = !state.connected || !(failed || isUnheard);
+  setText(byId("notice-open"), isUnheard ? "Change address" : "Open another run");
 }
 
 const seconds = (since) => Math.floor((performance.now() - since) / 1000);

@@ -74,7 +74,7 @@ function show() {
   }
   if (share !== null) setText(note, progressText(share, preview));
   else setText(note, newest ? resultText(newest) : !box.checked ? "Changes apply from the current scan onwards."
-    : state.status?.live ? "Live: changes of SLAM, tracks and classes re-map the run; others need points and apply from now on." : "Each change re-maps the run up to the shown scan.");
+    : state.status?.live ? "Live: changes of SLAM, tracks and classes re-map the run. Other changes, their undo and all changes after them apply from now on: they need points that only the recording has." : "Each change re-maps the run up to the shown scan.");
 }
 
 const lineOf = (kind, sign, node, why) => el("li", { "data-kind": kind }, el("b", { text: sign, "aria-hidden": "true" }), node, el("small", { text: why }));

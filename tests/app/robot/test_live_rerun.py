@@ -22,7 +22,7 @@ from pipeline.io.recording.mcap_writer import write_recording
 from pipeline.types.records import Frame
 from tests.app.robot.conftest import until
 from tests.app.robot.test_live_session import URI, FakeLink, announce
-from tests.app.worker.test_remap import BASE, FEWER, JUDGED, LATER, content_of
+from tests.app.worker.test_remap import BASE, FEWER, JUDGED, LATER, WIDER, content_of
 
 SCANS, ASKED = 40, 18  # no more wait for a mapper than are sent at once
 SEED = 3
@@ -141,3 +141,14 @@ def test_a_rerun_that_is_given_up_leaves_the_live_run_as_it_is(robot):
         each.send(SCANS)
     assert not here.session.is_remapping
     assert here.frames == other.frames
+
+
+def test_a_change_that_needs_points_and_its_undo_apply_from_now_on(robot):
+    here = robot()
+    here.send(ASKED)
+    for revision, parameters in enumerate((WIDER, BASE), 1):
+        here.session.set_parameters(parameters, revision, whole=True)
+        assert not here.session.is_remapping, "it could not be completed"
+        here.send(2)
+    (warning,) = [text for text in here.session.status().warnings if "not mapped again" in text]
+    assert "Open the recording of the run" in warning

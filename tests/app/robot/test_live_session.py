@@ -193,6 +193,20 @@ def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
         assert on.shown == sorted(set(on.shown)), "each scan is shown once"
 
 
+@pytest.mark.parametrize(
+    ("problem", "told"),
+    [
+        ("no router answers. Is it running?", "no router answers. Is it running? It is"),
+        ("cannot listen on 0.0.0.0:80: Permission denied", "0.0.0.0:80: Permission denied. It is"),
+    ],
+)
+def test_a_problem_of_the_link_ends_its_sentence(problem, told):
+    source = LiveSource(parse_address(URI), SourceOptions(), FakeLink)
+    source._link.problem = problem
+    assert f"{told} tried again every second" in source.waiting_for()
+    source.close()
+
+
 def mapped_link(on, sending, record: str = ""):
     """Map eleven scans of a live robot, with a file to record them, and return its link."""
     on.commands.put(Open(URI, record=record))

@@ -325,9 +325,13 @@ async def test_a_home_in_the_working_folder_is_not_the_home(
 
 async def test_sources_offer_scenarios_and_recordings(tmp_path: Path) -> None:
     (tmp_path / "done").mkdir()
-    for name in ("b.mcap", "a.pcap", ".hidden", "done/run.json"):
-        (tmp_path / name).touch()
-    async with running(Settings(recordings=tmp_path)) as (client, _):
+    for name in ("b.mcap", "a.pcap", ".hidden", "done/run.json", "written.mcap"):
+        (tmp_path / name).write_bytes(b"0")
+    (tmp_path / "begun.mcap").touch()
+    async with running(Settings(recordings=tmp_path)) as (client, dashboard):
+        dashboard.status = Status(
+            "playing", recording="recording written.mcap, 0 MB", recorded_file=str(tmp_path / "written.mcap")
+        )
         answer = (await client.get("/api/sources", headers=BEARER)).json()
     assert "sim:stand" in [scenario["uri"] for scenario in answer["scenarios"]]
     assert [each["uri"] for each in answer["recordings"]] == [f"{tmp_path}/a.pcap", f"{tmp_path}/b.mcap"]
@@ -348,13 +352,13 @@ def test_recordings_in_folders_are_named_by_their_path_in_the_data_folder(
         "a/b/c/d/deep.mcap",
     ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
+        (tmp_path / name).write_bytes(b"0")
     (tmp_path / "loop").symlink_to(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere.mcap")
     (tmp_path / "done").mkdir()
     for name in ("done/run.json", "done/a.laz"):
-        (tmp_path / name).touch()
+        (tmp_path / name).write_bytes(b"0")
     opener = readers.folder_opener
 
     def refused(folder: Path) -> object:

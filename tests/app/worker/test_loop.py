@@ -133,6 +133,26 @@ def test_compilation_is_reported_with_its_progress_and_no_silence_follows() -> N
     assert (after.state, after.detail) == ("playing", "")
 
 
+def test_a_compilation_while_a_source_is_opened_is_reported_of_that_source() -> None:
+    session, said = make_session(FakeSource(3)), list[FromWorker]()
+    commands: queue.Queue[ToWorker | None] = queue.Queue()
+    open_source = session._open_source
+
+    def compiles(uri: str, options: Any) -> Any:
+        driver.compiling()
+        return open_source(uri, options)
+
+    session._open_source = compiles
+    kernels = itertools.cycle([(60, 240)]).__next__
+    driver = WorkerLoop(session, commands, said.append, itertools.count(step=0.6).__next__, kernels=kernels)
+    for command in (Open("fake:one"), Open("fake:two"), None):
+        commands.put(command)
+    driver.run()
+    waiting = [m.status for m in said if isinstance(m, Report) and m.status.kernels_left == 180]
+    assert [(status.source, status.state) for status in waiting][-1] == ("fake:two", "starting")
+    assert waiting[-1].detail == COMPILING.capitalize()
+
+
 def test_points_and_the_time_line_are_there_before_the_kernels() -> None:
     session, said = make_session(FakeSource(9), compiling=lambda: iter([False] * 4)), list[FromWorker]()
     commands: queue.Queue[ToWorker | None] = queue.Queue()

@@ -538,9 +538,11 @@ def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str)
         robots=["a"],
         recording="",
         recorded_file="",
+        losses={"scans lost on the network": 3, "scans skipped because mapping was behind": 162},
     )
     told = with_robot(Status(state="playing", source="zenoh:"), cast(Any, robot))
     assert (told.state, told.detail) == (state, "" if waiting else "Nothing heard for 3 s")
+    assert (told.silence_s, told.scans_lost) == (3.0, 3)
 
 
 def test_a_source_without_a_mapper_is_closed() -> None:
