@@ -6,7 +6,6 @@ are imported inside `run`, so that `--help` answers at once.
 
 from __future__ import annotations
 
-import _thread
 import argparse
 import contextlib
 import difflib
@@ -229,22 +228,32 @@ def _stopping() -> Iterator[None]:
     numbers = [signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         numbers.append(signal.SIGINT)
-    before = {number: signal.signal(number, _stop) for number in numbers}
+    again: list[threading.Timer] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if not _is_in_compiler(frame):
+            raise KeyboardInterrupt
+        # A signal, which also wakes a call that waits.
+        again.append(threading.Timer(_AGAIN_S, signal.pthread_kill, (threading.get_ident(), number)))
+        again[-1].start()
+
+    before = {number: signal.signal(number, stop) for number in numbers}
     try:
         yield
     finally:
+        for timer in again:  # none acts after the handlers are those of before
+            timer.cancel()
+            timer.join()
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-def _stop(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, but not inside of the compiler: Python prints an exception that is raised in a
+def _is_in_compiler(frame: FrameType | None) -> bool:
+    """Return whether a frame was called from the compiler. Python prints an exception that is raised in a
     call from its C code and goes on, and an object that was not completed fails when it is deleted."""
     while frame is not None and not str(frame.f_globals.get("__name__")).startswith("llvmlite.binding"):
         frame = frame.f_back
-    if frame is None:
-        raise KeyboardInterrupt
-    threading.Timer(_AGAIN_S, _thread.interrupt_main, (number,)).start()
+    return frame is not None
 
 
 def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:

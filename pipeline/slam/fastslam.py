@@ -624,10 +624,11 @@ class FastSlam:
         self, state: SlamState, scans: tuple[ScanDetections, ...]
     ) -> tuple[KeyframeGraph, tuple[ScanDetections, ...]]:
         """Return the graph whose only keyframe has also the detections of the scans that are nearer to it
-        than to the newest scan, and the other scans. The keyframe fixes the frame of the map, so that the
-        noise of a single scan would move and turn the whole map."""
+        than to the newest scan, and the other scans, of which there is one at least if there are scans. The
+        keyframe fixes the frame of the map, so that the noise of a single scan would move and turn the whole
+        map."""
         first = state.graph.keyframes[0]
-        near = tuple(s for s in scans if s.distance - first.distance < state.distance - s.distance)
+        near = tuple(s for s in scans[:-1] if s.distance - first.distance < state.distance - s.distance)
         shown = np.array([first.scan, *(s.scan for s in near)])
         T_newest_base = state.genealogy.mean_motion_from(shown, normalised(state.log_weight))
         T_first_base = composed(np.tile(inverse(T_newest_base[:1]), (len(shown), 1)), T_newest_base)

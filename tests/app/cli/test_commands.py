@@ -111,12 +111,13 @@ def test_a_request_to_stop_that_came_inside_of_the_compiler_is_not_lost(capsys, 
         written.append("result")
 
     monkeypatch.setattr("app.cli.params.run", compile_one)
-    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    inherited, begin = signal.signal(signal.SIGINT, signal.default_int_handler), time.monotonic()
     try:
         stemmap(capsys, "params").refused(1, "stopped")
     finally:
         signal.signal(signal.SIGINT, inherited)
     assert written == ["object", "kernel"]
+    assert time.monotonic() - begin < 15.0, "a call that waits was not woken"
 
 
 @pytest.mark.parametrize("step", ["problems", "_build_parser"])

@@ -622,6 +622,15 @@ def test_the_first_keyframe_has_the_detections_of_the_scans_nearest_to_it():
     assert np.max(variance) < 0.2 * sigma**2
 
 
+def test_the_second_keyframe_has_detections_if_there_were_any_since_the_first():
+    slam, step = fresh(particles=5), FOREST.keyframe_distance / 10
+    for k in range(11):
+        seen = TREES - [k * step, 0.0] if k in (0, 2, 3) else TREES[:0]
+        slam.process(k, Pose2(step if k else 0.0), detections(seen), NOTHING_SEEN)
+    first, second = slam.state.graph.keyframes
+    assert len(first.birth) == len(second.birth) == len(TREES)
+
+
 def test_a_loop_between_two_used_scans_has_the_whole_motion(monkeypatch):
     slam = fresh(particles=5, update_distance=5.0)
     for k in range(4):
