@@ -624,7 +624,7 @@ def test_the_first_keyframe_has_the_detections_of_the_scans_nearest_to_it():
 
 def test_the_second_keyframe_has_detections_if_there_were_any_since_the_first():
     slam, step = fresh(particles=5), FOREST.keyframe_distance / 10
-    for k in range(11):
+    for k in range(12):
         seen = TREES - [k * step, 0.0] if k in (0, 2, 3) else TREES[:0]
         slam.process(k, Pose2(step if k else 0.0), detections(seen), NOTHING_SEEN)
     first, second = slam.state.graph.keyframes
