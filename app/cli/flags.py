@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from app.common.text import COMPILING, count
 from pipeline.errors import ParameterError, SourceError, StemmapError
@@ -18,6 +18,7 @@ from pipeline.errors import ParameterError, SourceError, StemmapError
 if TYPE_CHECKING:
     from app.sources.request import SourceRequest
     from pipeline.config import Parameters
+    from pipeline.types.records import Record
 
 SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag), a folder of scans (.bin, .pcd, .ply, "
@@ -29,7 +30,7 @@ SOURCE_HELP = (
 
 
 MOUNT = "X,Y,Z,ROLL,PITCH,YAW"
-COMPILATION_S = 10.0  # interval of the messages on compilation
+COMPILATION_S = 10.0  # interval of the messages on compilation, and of progress in a file
 
 
 def program() -> str:
@@ -436,6 +437,53 @@ def progress_bar(total: int | None, unit: str, title: str = "") -> Any:  # noqa:
     return tqdm(
         total=total, unit=unit, desc=title, file=sys.stderr, disable=not sys.stderr.isatty(), leave=False
     )
+
+
+def with_progress(records: Iterator[Record], scans: int | None, title: str) -> Iterator[Record]:
+    """Yield records, and show the number of scans among them, see `scan_progress`.
+
+    Args:
+        records: Records of a source.
+        scans: Number of its scans; None if it is unknown.
+        title: What is done.
+    """
+    from pipeline.types.records import Scan
+
+    with scan_progress(scans, title) as bar:
+        for record in records:
+            yield record
+            bar.update(isinstance(record, Scan))
+
+
+def scan_progress(scans: int | None, title: str) -> Any:  # noqa: ANN401 - tqdm has no types
+    """Return a progress bar of scans; lines at intervals of COMPILATION_S if standard error is no terminal.
+
+    Args:
+        scans: Number of scans; None if it is unknown.
+        title: What is done.
+    """
+    return progress_bar(scans, "scan", title) if sys.stderr.isatty() else _ProgressLines(scans, title)
+
+
+class _ProgressLines:
+    """A progress bar for a file: lines such as "mapping: scan 120 of 406"."""
+
+    def __init__(self, scans: int | None, title: str) -> None:
+        self._title, self._of = title, "" if scans is None else f" of {scans}"
+        self._done, self._told_at = 0, time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def update(self, scans: int) -> None:
+        """Count scans, and print a line if the last one is older than COMPILATION_S."""
+        self._done += scans
+        if time.monotonic() < self._told_at + COMPILATION_S:
+            return
+        self._told_at = time.monotonic()
+        print(f"{self._title}: scan {self._done}{self._of}", file=sys.stderr, flush=True)
 
 
 @contextmanager

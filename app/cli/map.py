@@ -162,7 +162,7 @@ def map_to(
         compile_ahead()
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
-        with flags.progress_bar(opened.description.scans, "scan", "mapping") as bar:
+        with flags.scan_progress(opened.description.scans, "mapping") as bar:
 
             def mapped(frame: Frame, mapper: Mapper) -> None:
                 on_scan(frame, mapper, live)

@@ -45,6 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
             file = Path(folder) / "run.mcap"
             with closing(open_source(arguments.source)) as source:
                 known = source.description
-                write_recording(file, source.records(), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
+                records = flags.with_progress(source.records(), known.scans, f"simulating {arguments.source}")
+                write_recording(file, records, sensor=known.sensor, T_base_lidar=known.T_base_lidar)
         print(f"{send(file, arguments.port)} scans were sent")
     return 0

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import compilation_notice, progress_bar, refuse_to_overwrite, seed
+from app.cli.flags import compilation_notice, refuse_to_overwrite, seed, with_progress
 
 if TYPE_CHECKING:
-    from pipeline.io.readers.simulated import SimulatedSource
     from pipeline.types.camera import Picture
     from pipeline.types.records import Record
 
@@ -63,9 +62,10 @@ def run(arguments: argparse.Namespace) -> int:
         )
     description = source.description
     truth = source.truth()
-    records: Iterator[Record | Picture] = _with_progress(source)
+    known = with_progress(source.records(), source.description.scans, "simulating")
+    records: Iterator[Record | Picture] = known
     if arguments.camera:
-        records = with_pictures(_with_progress(source), source.run.scene.truth, source.run.true_path())
+        records = with_pictures(known, source.run.scene.truth, source.run.true_path())
     write_recording(
         out,
         records,
@@ -99,13 +99,3 @@ def _uri(arguments: argparse.Namespace) -> str:
         if value is not None:
             uri += f"{'&' if '?' in uri else '?'}{key}={value}"
     return uri
-
-
-def _with_progress(source: SimulatedSource) -> Iterator[Record]:
-    """Yield the records of a source, with a progress bar of its scans if standard error is a terminal."""
-    from pipeline.types.records import Scan
-
-    with progress_bar(source.description.scans, "scan") as bar:
-        for record in source.records():
-            yield record
-            bar.update(isinstance(record, Scan))

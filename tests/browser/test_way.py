@@ -80,7 +80,8 @@ UNHEARD = """async () => {
   const { state, changed } = await import('/static/js/core/store.js');
   const detail = 'Waiting: no connection to tcp/127.0.0.1:7447: no Zenoh router answers there. Is it '
     + 'running, is the address right, and is the network up? It is tried again every second';
-  state.status = { ...state.status, live: true, state: 'waiting', detail, scan_index: -1 };
+  state.status = { ...state.status, live: true, state: 'waiting', detail, scan_index: -1,
+    source: 'zenoh:tcp/192.168.1.7:7448?robot=red' };
   changed('status');
   return document.querySelector('#notice').hidden;
 }"""
@@ -193,6 +194,53 @@ def test_a_recording_begins_with_one_press_and_ends_with_two(dashboard: Dashboar
     page.unroute("**/api/command")
     page.evaluate(REAL_STATUS)
     expect(page.locator("#recording")).to_be_hidden()
+
+
+# What is shown when a recording has ended, or the kernels are compiled for the source that is opened.
+ENDED = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  for (const recording of ['recording run.mcap, 2 MB', 'recorded run.mcap, 3 MB']) {
+    state.status = { ...state.status, live: true, state: 'playing', recording,
+      recorded_file: '/data/run.mcap' };
+    changed('status');
+  }
+  return [document.querySelector('#problem').innerText, document.querySelector('#speed').disabled];
+}"""
+OPENING = """async (source) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.status = { ...state.status, source, state: 'starting', detail: 'Kernels are compiled',
+    kernels_left: 12, compiled: 0.5, compiling_since_s: Date.now() / 1000 - 40 };
+  changed('status');
+  return [document.querySelector('#source-waits').innerText, document.querySelector('#source-none').hidden];
+}"""
+
+
+def test_the_end_of_a_recording_names_its_file_and_size(dashboard: Dashboard):
+    dashboard.stand(6.05)
+    text, has_no_speed = dashboard.page.evaluate(ENDED)
+    assert "Recorded run.mcap, 3 MB: /data/run.mcap" in text
+    assert has_no_speed
+    dashboard.page.evaluate(REAL_STATUS)
+
+
+def test_a_wrong_address_is_changed_from_its_message_and_the_wait_has_a_reason(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    page.route("**/api/open", lambda route: route.fulfill(status=202, json={}))
+    page.evaluate(UNHEARD)
+    page.get_by_role("button", name="Change address").click()
+    expect(page.get_by_label("Address of the router")).to_have_value("192.168.1.7")
+    page.get_by_label("Port", exact=True).fill("7449")
+    uri = "zenoh:tcp/192.168.1.7:7449?robot=red"
+    expect(page.locator("#source-uri")).to_have_value(uri)
+    page.locator("#source-open").click()
+    expect(page.locator("#source-waits")).to_contain_text(f"Opening {uri}")
+    waits, is_hidden = page.evaluate(OPENING, uri)
+    assert "Kernels are compiled. 50 % done after 40 s, 12 kernels left, about 40 s." in waits
+    assert is_hidden, "that it is not in the list says nothing"
+    page.locator("#source-close").click()
+    page.unroute("**/api/open")
+    page.evaluate(REAL_STATUS)
 
 
 SIGNALS = """() => {

@@ -28,6 +28,7 @@ export async function openSources() {
   address.focus();
   try {
     await listPlaces(choose);
+    sift(requested !== null);
   } catch (error) {
     say(error.message);
   }

@@ -13,6 +13,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from app.cli import COMMANDS, _check_command, flags, main
@@ -22,6 +23,7 @@ from pipeline.config import PRESETS, field_specs, from_toml, preset
 from pipeline.jit import on_compiling, others_compile
 from pipeline.odometry.lidar_odometry import LOST
 from pipeline.simulation.scenarios import SCENARIOS
+from pipeline.types.records import Notice, Scan
 
 RUN = "sim:paper?duration=2"
 
@@ -76,6 +78,20 @@ def test_compilation_is_reported_once_and_then_its_progress(capsys, monkeypatch)
         for now[0], compiled[0] in ((0.0, 20), (9.0, 40), (10.0, 50), (15.0, 60), (20.0, 200)):
             others_compile()
     assert capsys.readouterr().err.splitlines() == [COMPILING, "25 % of the kernels are compiled"]
+
+
+@pytest.mark.parametrize(("scans", "of"), [(406, " of 406"), (None, "")])
+def test_progress_in_a_file_is_a_line_every_ten_seconds(capsys, monkeypatch, scans, of):
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    scan = Scan(0, np.zeros((0, 3), np.float32))
+    records = (Notice(0, "") if k % 2 else scan for k in range(48))
+    shown = flags.with_progress(records, scans, "simulating sim:stand")
+    for now[0], _ in enumerate(shown):
+        pass
+    assert capsys.readouterr().err.splitlines() == [
+        f"simulating sim:stand: scan {n}{of}" for n in (6, 11, 16, 21)
+    ]
 
 
 def test_a_request_to_stop_that_came_while_kernels_were_loaded_is_one(capsys, monkeypatch):
