@@ -239,7 +239,7 @@ function reviewText() {
   const of = Object.fromEntries(STATES.map((name) => [name, 0]));
   for (const tree of trees()) of[reviewOf(tree)] += 1;
   const all = trees().length;
-  if (!all) return "";
+  if (!all) return byPeopleText();
   const states = STATES.slice(1).filter((name) => of[name]).map((name) => `${of[name]} ${name}`);
   return [`Review: ${of.confirmed + of.rejected} of ${count(all, "found tree")} reviewed${states.length ? ` (${states.join(", ")})` : ""}.`, byPeopleText()].filter(Boolean).join(" ");
 }
