@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 # Largest distance between an annotation and the same object in a map or a ground truth [m].
 SAME_THING = 0.5
+# Reviews by the class of the annotation.
+_STATES = {**dict.fromkeys(KINDS, REJECTED), "tree": CONFIRMED, SKIPPED: SKIPPED}
 # What figures and exports of a run need, besides its trees.
 _FILES = ("path.csv", "terrain.csv", "seen.csv", "run.json", "georeference.json")
 
@@ -46,47 +48,47 @@ def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Conte
     """Return a dict from the number of each reviewed tree to its review: CONFIRMED for the class "tree",
     REJECTED for another class, SKIPPED if no annotation of the tree states a class.
 
-    An annotation belongs to the tree that is nearest to it, if it is nearer than SAME_THING. Of several
-    annotations of a tree the nearest one that states a class counts, of equally near ones the last. The page
+    A tree has at most one annotation. It is one to which no other tree is nearer, and nearer than SAME_THING:
+    the nearest one that states a class, of equally near ones the last. The others belong to no tree. The page
     has the same rule (`paired` in static/js/annotate/annotations.js).
 
     Args:
         numbers, position: Numbers of the trees, and their positions in the map, shape (T, 2) [m].
         contents: The annotations in the same frame; plots and frames are ignored.
     """
+    reviews = [content for content in contents if content.kind in _STATES]
+    of_tree = _annotation_of_tree(position, reviews)
+    return {numbers[row]: _STATES[reviews[k].kind] for row, k in of_tree.items()}
+
+
+def _annotation_of_tree(position: Float, reviews: Sequence[Content]) -> dict[int, int]:
+    """Return a dict from the row of each tree that has an annotation to the index of it, see `reviews_of`."""
     from scipy.spatial import cKDTree
 
-    states = {**dict.fromkeys(KINDS, REJECTED), "tree": CONFIRMED, SKIPPED: SKIPPED}
-    reviews = [content for content in contents if content.kind in states]
-    if not reviews or not len(numbers):
+    if not reviews or not len(position):
         return {}
     distance, row = cKDTree(position).query([(content.x, content.y) for content in reviews])
     states_class = np.array([content.kind != SKIPPED for content in reviews])
-    found: dict[int, str] = {}
-    for k in np.lexsort((-distance, states_class)):  # the one that counts comes last
-        if distance[k] < SAME_THING:
-            found[numbers[row[k]]] = states[reviews[k].kind]
-    return found
+    order = np.lexsort((-distance, states_class))  # the one that counts comes last
+    return {int(row[k]): int(k) for k in order if distance[k] < SAME_THING}
 
 
 def measured_by_people(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> ByPeople:
-    """Return what people measured. An annotation belongs to a tree as in `reviews_of`; of several with a
-    diameter the nearest one counts. One that belongs to no tree of the map is a tree that the map lacks.
+    """Return what people measured. An annotation that decides the review of a tree has its diameter; every
+    other one of the class "tree" is a tree that the map lacks, as a twin stem or a stem beside a rejected
+    stake.
 
     Args:
         numbers, position, contents: See `reviews_of`.
     """
-    from scipy.spatial import cKDTree
-
-    stated = as_truth([content for content in contents if content.kind == "tree"])
-    place, tape = np.stack([stated.x, stated.y], axis=1), dict[int, float]()
-    if not len(place) or not len(numbers):
-        return ByPeople(tape, place, stated.dbh)
-    distance, row = cKDTree(position).query(place)
-    for k in np.argsort(-distance, kind="stable").tolist():  # the nearest one comes last
-        if distance[k] < SAME_THING and np.isfinite(stated.dbh[k]):
-            tape[numbers[row[k]]] = float(stated.dbh[k])
-    return ByPeople(tape, place[distance >= SAME_THING], stated.dbh[distance >= SAME_THING])
+    reviews = [content for content in contents if content.kind in _STATES]
+    of_tree = _annotation_of_tree(position, reviews)
+    stated = as_truth(reviews)
+    is_tree = np.array([content.kind == "tree" for content in reviews], np.bool_)
+    measured = is_tree & np.isfinite(stated.dbh)
+    tape = {numbers[row]: float(stated.dbh[k]) for row, k in of_tree.items() if measured[k]}
+    added = np.setdiff1d(np.flatnonzero(is_tree), list(of_tree.values()))
+    return ByPeople(tape, np.stack([stated.x, stated.y], axis=1)[added], stated.dbh[added])
 
 
 def by_people_text(people: ByPeople, numbers: Sequence[int], position: Float) -> str:

@@ -161,7 +161,8 @@ def stand_figures(
 
     Args:
         trees: Trees in the observed part, of any diameter.
-        outside: Trees in the rest of the plot, which count only in the `_plain` values.
+        outside: Trees in the rest of the plot, which count only in the `_plain` values; added ones do not
+            count.
         area: Area of the plot [m^2].
         seen: Area of the observed part of the plot [m^2].
         perimeter: Length of the border of the observed part [m], for the edge correction of the Clark-Evans
@@ -211,6 +212,7 @@ def stand_figures(
     values = dict.fromkeys(FIGURES, Estimate())
     if seen <= 0.0:
         return StandFigures(area, 0.0, 0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
+    outside = outside.where(outside.of_map)  # an added tree counts in the observed part only
     every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
     plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))), 0.0)
     values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)

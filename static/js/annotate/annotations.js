@@ -218,7 +218,7 @@ export const importTable = (table, unit) => edit(() => call("POST", "/import", {
 // --- review of the found trees -------------------------------------------------------------------------------
 
 // {ofTree, treeOf}: the annotation of each found tree by its number, and the number of the tree of each annotation by its id.
-// An annotation belongs to the found tree that is nearest to it; where a tree has several, those that state something count.
+// Of the annotations to which a found tree is the nearest one, the nearest that states something belongs to it; the others belong to none.
 const pairs = { map: null, annotations: null, ofTree: new Map(), treeOf: new Map() };
 
 function paired() {
@@ -227,10 +227,10 @@ function paired() {
   for (const row of [...skips(), ...rows()]) {
     const tree = nearest(trees(), (each) => distance(row, each), state.annotations.same_thing_m);
     if (!tree) continue;
-    pairs.treeOf.set(row.id, tree.number);
     const other = pairs.ofTree.get(tree.number);
     if (!other || other.kind === SKIPPED || distance(row, tree) <= distance(other, tree)) pairs.ofTree.set(tree.number, row);
   }
+  for (const [number, row] of pairs.ofTree) pairs.treeOf.set(row.id, number);
   return pairs;
 }
 

@@ -38,12 +38,10 @@ def test_the_nearest_annotation_decides(contents, reviews):
     assert reviews_of([], np.zeros((0, 2)), contents) == {}
 
 
-def test_the_nearest_tape_counts_and_what_is_far_from_trees_is_added():
+def test_the_nearest_tape_counts_and_what_belongs_to_no_tree_is_added():
     far = Content(0.0, SAME_THING + 0.01, "tree", 0.4)
     contents = [
-        Content(0.0, 0.0),
-        Content(0.0, 0.3, "tree", 0.21),
-        Content(0.0, 0.2, "tree", 0.22),
+        Content(0.0, 0.1, "tree", 0.22),
         Content(2.0, 0.0, "pole", 0.5),
         Content(9.0, 9.0, "pole"),
         far,
@@ -54,6 +52,21 @@ def test_the_nearest_tape_counts_and_what_is_far_from_trees_is_added():
         assert (each.added.tolist(), each.added_dbh.tolist()) == ([[0.0, SAME_THING + 0.01]], [0.4])
     nothing = measured_by_people([1, 2, 3], PLACES, [])
     assert (nothing.tape, nothing.added.shape) == ({}, (0, 2))
+
+
+@pytest.mark.parametrize(
+    ("contents", "tape", "added"),
+    [
+        ([Content(2.0, 0.0, "pole"), Content(2.3, 0.0, "tree", 0.31)], {}, [0.31]),  # a stem beside a stake
+        ([Content(2.4, 0.0, "tree", 0.3), Content(2.0, 0.0, "tree", 0.2)], {2: 0.2}, [0.3]),  # a twin stem
+        ([Content(2.0, 0.0), Content(2.4, 0.0, "tree", 0.3)], {}, [0.3]),
+        ([Content(2.0, 0.0, SKIPPED), Content(2.4, 0.0, "tree", 0.3)], {2: 0.3}, []),
+        ([Content(2.0, 0.0, "tree", 0.2), Content(2.3, 0.0, "pole", 0.1)], {2: 0.2}, []),
+    ],
+)
+def test_a_tree_has_one_annotation_and_the_others_are_added_trees(contents, tape, added):
+    people = measured_by_people([1, 2, 3], PLACES, contents)
+    assert (people.tape, people.added_dbh.tolist(), len(people.added)) == (tape, added, len(added))
 
 
 def test_what_people_measured_is_exported_beside_the_map(tmp_path):

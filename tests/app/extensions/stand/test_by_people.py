@@ -95,10 +95,16 @@ def test_a_thin_tree_by_tape_does_not_count(run):
 
 
 def test_the_diameter_of_a_rejected_tree_does_not_count(run):
-    stated = [Content(1.0, 1.0, "pole"), Content(1.0, 1.1, "tree", 0.4)]
-    result = figures_of_stated(run, stated)
+    result = figures_of_stated(run, [Content(1.0, 1.0, "pole", 0.4)])
     assert result.by_people == {"all": (0, 0, 1)}
     assert result.figures["all"].values["mean_dbh_cm"].value == pytest.approx(20.0)
+
+
+def test_a_stem_beside_a_rejected_stake_counts(run):
+    result = figures_of_stated(run, [Content(1.0, 1.0, "pole"), Content(1.0, 1.3, "tree", 0.31)])
+    assert result.by_people == {"all": (1, 1, 1)}
+    assert result.figures["all"].trees == 100
+    assert result.figures["all"].values["mean_dbh_cm"].value == pytest.approx((99 * 20.0 + 31.0) / 100)
 
 
 @given(st.permutations(range(6)), st.lists(st.none() | st.floats(0.08, 0.6), min_size=6, max_size=6))

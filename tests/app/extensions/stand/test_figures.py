@@ -142,6 +142,15 @@ def test_more_trees_than_the_observed_part_lets_expect_make_the_errors_unknown()
     assert not any("not like" in text for text in alike.warnings)
 
 
+def test_trees_that_people_add_in_the_part_out_of_sight_change_no_figure():
+    outside = replace(trees_of([0.3] * 18), added=np.arange(18) >= 2)
+    f = figures(trees_of([0.3] * 50), seen=900.0, outside=outside)
+    of_map = figures(trees_of([0.3] * 50), seen=900.0, outside=trees_of([0.3] * 2))
+    np.testing.assert_equal(dict(f.values), dict(of_map.values))
+    assert f.values["n_ha"].se > 0.0
+    assert f.warnings == ()
+
+
 def test_trees_that_are_not_detected_are_added_with_their_error():
     random = np.random.default_rng(2)
     errors, told = [], []
