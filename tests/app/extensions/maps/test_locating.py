@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -145,6 +146,20 @@ async def test_routes(folder):
         assert (await client.get("/api/localise")).json()["stems"] == []
 
 
+def test_what_is_neither_a_file_nor_a_folder_is_refused_without_reading_it(tmp_path):
+    os.mkfifo(tmp_path / "pipe.stems")
+    for path in (tmp_path / "pipe.stems", Path("/dev/zero")):
+        with pytest.raises(StemmapError, match="not a stored map"):
+            read_stored_map(path)
+
+
+async def test_the_home_of_an_unknown_user_is_no_folder(tmp_path):
+    async with running(Settings(recordings=tmp_path, files="any")) as (client, _):
+        answer = await client.post("/api/localise", json={"path": "~no-such-user/map"}, headers=BEARER)
+        assert answer.status_code == 409
+        assert "there is no such folder or file" in answer.text
+
+
 async def test_a_folder_or_a_file_of_the_server_is_a_stored_map(folder, tmp_path_factory):
     stored, outside = read_stored_map(folder), tmp_path_factory.mktemp("outside")
     for place in (folder.parent, outside):
@@ -159,7 +174,7 @@ async def test_a_folder_or_a_file_of_the_server_is_a_stored_map(folder, tmp_path
             return await client.post("/api/localise", json={"path": str(path)})
 
         listed = (await client.get("/api/localise/files")).json()["files"]
-        assert listed == [str(folder.parent / name) for name in ("link.stems", "stand.stems")]
+        assert listed == [str(folder.parent / "stand.stems")]
         for path in (folder, folder.parent / "stand.stems", f"file://{folder}"):
             answer = await begun(path)
             assert answer.status_code == 202, answer.text
