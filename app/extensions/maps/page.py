@@ -38,25 +38,27 @@ class Locating:
         self._lock = asyncio.Lock()  # held by `begin`, `forget` and `close`, so that one task runs at a time
         self._run: LocalisedRun | None = None
         self._problem = ""
+        self._serial = 0  # number of maps so far
         self.name = ""
         self.stored: StoredMap | None = None
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state as a dict of JSON values: `name`; `state`, "idle", "searching", "found",
-        "not_found", "absent" or "failed"; `text`; and `pose`, the frame of the stored map in that of the open
-        run, [x, y, yaw] [m, m, rad], None unless found."""
+        """Return the state as a dict of JSON values: `name`; `serial`, which tells maps of one name apart;
+        `state`, "idle", "searching", "found", "not_found", "absent" or "failed"; `text`; and `pose`, the
+        frame of the stored map in that of the open run, [x, y, yaw] [m, m, rad], None unless found."""
+        of = {"name": self.name, "serial": self._serial}
         if self.stored is None:
-            return {"name": "", "state": "idle", "text": "", "pose": None}
+            return {**of, "state": "idle", "text": "", "pose": None}
         if self._problem:
-            return {"name": self.name, "state": "failed", "text": self._problem, "pose": None}
+            return {**of, "state": "failed", "text": self._problem, "pose": None}
         if self._run is None:
-            return {"name": self.name, "state": "searching", "text": "not found yet", "pose": None}
+            return {**of, "state": "searching", "text": "not found yet", "pose": None}
         now = self._run.localisation
         there = None if now.T_map_odom is None else now.T_map_odom.inverse()
         pose = None if there is None else [round(float(value), 5) for value in there.as_array()]
         state = now.state.name.lower()
         text = f"{now.text}; play the run again to search more of it" if state == "not_found" else now.text
-        return {"name": self.name, "state": state, "text": text, "pose": pose}
+        return {**of, "state": state, "text": text, "pose": pose}
 
     async def begin(self, name: str, folder: Path) -> None:
         """Read a stored map and begin to locate the open run in it, in place of an earlier one.
@@ -76,7 +78,7 @@ class Locating:
             if not len(stored):
                 raise StemmapError("the map has no trees", where=name)
             await self._end()
-            self.name, self.stored = name, stored
+            self.name, self.stored, self._serial = name, stored, self._serial + 1
             self._task = asyncio.create_task(self._follow(stored))
             self._tell(self.as_plain())
 
@@ -112,7 +114,9 @@ class Locating:
                 except Exception as error:
                     _log.exception("the localisation in the map of %s failed", self.name)
                     self._run, self._problem = None, f"the localisation failed: {error}"
-            if self._run is not None and self._dashboard.status.state == "finished":
+            is_searched = self._dashboard.shown is shown  # no further scan has arrived meanwhile
+            is_over = is_searched and self._dashboard.status.state in ("finished", "failed")
+            if self._run is not None and is_over:
                 self._run.localiser.end()
             if self._dashboard.run == run and (now := self.as_plain()) != before:
                 before = now

@@ -14,7 +14,7 @@ from starlette.responses import Response
 from app.common.settings import Settings
 from app.extensions.maps.page import Locating
 from app.web.responses import Body, json_reply
-from app.web.routes.access import Dash, Deployment, Permitted, checked_uri, of_app
+from app.web.routes.access import Dash, Deployment, Permission, Permitted, checked_uri, of_app
 from app.web.routes.runs import run_folder, whole_run
 from pipeline.io.readers import path_of
 
@@ -46,7 +46,7 @@ async def start_localising(
     """POST /api/localise: locate the open run in a stored map, and return the state, with 202. 403 for a path
     that the caller may not open, 404 for an unknown run, 409 if it is no stored map or has no trees."""
     if body.path:
-        place = Path(path_of(checked_uri(body.path, permitted))).expanduser()
+        place = Path(path_of(checked_uri(body.path, permitted)))
         await locating.begin(place.name, place)
         return json_reply(locating.as_plain(), 202)
     name = str((await whole_run(body.run, settings, dashboard))["name"])
@@ -56,15 +56,16 @@ async def start_localising(
 
 
 @router.get("/localise/files")
-async def list_files(settings: Deployment) -> Response:
-    """GET /api/localise/files: return `files`, the paths of the .stems files directly in the data folders."""
-    return json_reply({"files": await asyncio.to_thread(_files, settings)})
+async def list_files(settings: Deployment, permitted: Permitted) -> Response:
+    """GET /api/localise/files: return `files`, the paths of the .stems files directly in the data folders
+    that the caller may open."""
+    return json_reply({"files": await asyncio.to_thread(_files, settings, permitted)})
 
 
-def _files(settings: Settings) -> list[str]:
+def _files(settings: Settings, permitted: Permission) -> list[str]:
     """Return the paths of `list_files`, at most MOST_FILES."""
     found = [str(path) for folder in settings.data_folders for path in sorted(folder.glob("*.stems"))]
-    return found[:MOST_FILES]
+    return [path for path in found if permitted(path) is not None][:MOST_FILES]
 
 
 @router.delete("/localise")

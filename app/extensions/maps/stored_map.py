@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from stat import S_ISREG
 
 import numpy as np
 
@@ -21,10 +22,14 @@ def read_stored_map(path: Path) -> StoredMap:
     Raises:
         StemmapError: The folder or file cannot be read, or is not a stored map.
     """
+    content = b""
     try:
+        path = path.expanduser()
         is_run, is_folder = (path / "run.json").is_file(), path.is_dir()
-        content = b"" if is_folder or path.stat().st_size > LARGEST_FILE else path.read_bytes()
-    except (FileNotFoundError, ValueError):  # ValueError: the text is no path
+        if not is_folder and S_ISREG(path.stat().st_mode):  # a device or a pipe may have no end
+            with path.open("rb") as file:
+                content = file.read(LARGEST_FILE)  # a larger file is no stored map
+    except (FileNotFoundError, ValueError, RuntimeError):  # no path, or "~name" of an unknown user
         raise StemmapError("there is no such folder or file", where=str(path), remedy=A_MAP) from None
     except OSError as error:
         raise StemmapError(f"cannot read it: {error.strerror}", where=str(path), remedy=A_MAP) from None

@@ -80,7 +80,7 @@ class Localisation:
         residual: Root mean square distance of the stems that agree [m]; NaN without any.
         height: Height and tilt of the local frame; None if unknown.
         driven: Distance driven [m].
-        found_at: Distance driven when it was last found [m]; NaN if it never was.
+        found_at: Distance driven when it was last found [m]; NaN if it never was, or this fix was withdrawn.
         searches: Number of searches.
         withdrawn: Number of fixes that were withdrawn.
         reason: Why the last search found nothing; "" if found or not searched.
@@ -106,12 +106,12 @@ class Localisation:
             sigma = math.sqrt(0.5 * (self.covariance[0, 0] + self.covariance[1, 1]))
             agree = f"{self.stems} of {self.of} stems in view agree" if self.of else "too few stems in view"
             return f"found: {agree}, {sigma:.2f} m"
+        if not math.isnan(self.found_at):
+            return f"found at {self.found_at:.0f} m, lost since: {self.reason}"
         if self.state is State.ABSENT:
             return str(self.state.value)
         if self.withdrawn:
             return "not found: the stems contradicted the place that was found"
-        if not math.isnan(self.found_at):
-            return f"found at {self.found_at:.0f} m, lost since: {self.reason}"
         if self.state is State.NOT_FOUND:
             return f"not found in {self.driven:.0f} m of driving"
         return str(self.state.value)
@@ -235,7 +235,9 @@ class Localiser:
                     self.localisation, state=State.SEARCHING, searches=k, reason="the stems in view disagree"
                 )
             return
-        absent = _would_be_found(fix, len(stems), len(index.stems), level)
+        # A robot that was found has left the map; the map is still that of this run.
+        was_found = not math.isnan(self.localisation.found_at)
+        absent = not was_found and _would_be_found(fix, len(stems), len(index.stems), level)
         state = State.ABSENT if absent else State.SEARCHING
         self.localisation = replace(self.localisation, state=state, searches=k, reason=fix.reason or "")
 
@@ -250,13 +252,13 @@ class Localiser:
         needed = 0.0 if self.localisation.T_map_odom is not None else ODDS
         if self._odds < -ODDS:
             self._first = len(self._stamp_ns) - 1  # what was seen before is in another place of the local map
-            self._search_again("contradicted", withdrawn=self.localisation.withdrawn + 1)
+            self._search_again("contradicted", is_wrong=True)
         elif fix.inside < FEWEST:
             self._drift(prior)
         elif fix.pose is not None and odds > needed and len(fix.local) >= AGREEING * fix.inside:
             self._use(fix, fix.pose, terrain, is_new=False)
         elif _is_uncertain(prior):
-            self._search_again("the stems in view disagree", withdrawn=self.localisation.withdrawn)
+            self._search_again("the stems in view disagree")
         else:
             self.localisation = replace(
                 self.localisation, state=State.SEARCHING, T_map_odom=None, covariance=np.zeros((3, 3)),
@@ -302,7 +304,7 @@ class Localiser:
         """Keep the pose with the covariance of `_prior`, but none where the last stems disagreed; search
         again if it is too uncertain for a fix."""
         if _is_uncertain(covariance):
-            self._search_again("outside of the map", withdrawn=self.localisation.withdrawn)
+            self._search_again("outside of the map")
         elif self.localisation.T_map_odom is not None:
             self.localisation = replace(
                 self.localisation, covariance=covariance + self._shared, stems=0, of=0
@@ -314,15 +316,15 @@ class Localiser:
         variance = (SHARED * self._slack) ** 2
         return np.diag([variance, variance, 0.0])
 
-    def _search_again(self, reason: str, *, withdrawn: int) -> None:
-        """Give up the fix."""
+    def _search_again(self, reason: str, *, is_wrong: bool = False) -> None:
+        """Give up the fix; withdraw it if it is wrong."""
         self._fix, self._searched_stems = None, 0
         before = self.localisation
         self.localisation = Localisation(
             driven=before.driven,
-            found_at=before.found_at,
+            found_at=math.nan if is_wrong else before.found_at,
             searches=before.searches,
-            withdrawn=withdrawn,
+            withdrawn=before.withdrawn + is_wrong,
             reason=reason,
         )
 

@@ -11,16 +11,18 @@ import { colours } from "../../core/theme.js";
 import { when } from "../../runs/figures.js";
 import { extend } from "../../shell/extensions.js";
 
-let now = { name: "", state: "idle", text: "", pose: null };
-let stems = [], stemsOf = ""; // [x, y] of the stored map in its frame, and the name of its run
+let now = { name: "", serial: 0, state: "idle", text: "", pose: null };
+let stems = [], stemsOf = 0; // [x, y] of the stored map in its frame, and its serial
 
 async function show(message) {
   now = message;
-  if (now.state !== "idle" && (stemsOf !== now.name || now.state === "searching")) { // another map may have the same name
-    stemsOf = now.name;
-    stems = (await attempted(() => get("/api/localise")))?.stems ?? [];
+  if (now.state !== "idle" && (stemsOf !== now.serial || now.state === "searching")) { // a server that started again counts anew
+    stemsOf = now.serial;
+    stems = [];
+    const got = await attempted(() => get("/api/localise"));
+    if (got?.serial === stemsOf) stems = got.stems; // else another map was begun meanwhile
   }
-  if (now.state === "idle") stemsOf = "";
+  if (now.state === "idle") stemsOf = 0;
   const status = byId("localise-status");
   status.hidden = now.state === "idle";
   status.classList.toggle("lost", now.state !== "found");

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ import pytest
 
 from app.common.settings import Settings
 from app.extensions.maps import page
+from app.extensions.maps.localisation import StoredMap
 from app.extensions.maps.page import Locating
 from app.extensions.maps.stored_map import read_stored_map, write_stored_map
 from pipeline.errors import StemmapError
@@ -67,7 +69,8 @@ async def test_it_is_found_told_and_forgotten(folder, monkeypatch):
     locating = Locating(here, told.append)
     assert locating.as_plain()["state"] == "idle"
     await locating.begin("stand", folder)
-    assert told[-1] == {"name": "stand", "state": "searching", "text": "not found yet", "pose": None}
+    begun = {"name": "stand", "serial": 1, "state": "searching", "text": "not found yet", "pose": None}
+    assert told[-1] == begun
     true = Pose2(30.0, 30.0, 0.5)  # of the open run in the stored map
     place = stand(1, side=60.0)
     near = place[np.hypot(*(place - 30.0).T) < 14.0]
@@ -84,16 +87,49 @@ async def test_it_is_found_told_and_forgotten(folder, monkeypatch):
     await locating.close()
 
 
-async def test_at_the_end_of_the_run_it_is_not_searched_any_more(folder, monkeypatch):
+@pytest.mark.parametrize("state", ["finished", "failed"])
+async def test_at_the_end_of_the_run_it_is_not_searched_any_more(folder, monkeypatch, state):
     monkeypatch.setattr(page, "PAUSE_S", 0.01)
     told: list[dict[str, Any]] = []
     here = dashboard()
     locating = Locating(here, told.append)
     await locating.begin("stand", folder)
     here.shown = shown(1_000_000_000, np.array([[3.0, 2.0]]), Pose2())
-    here.status.state = "finished"
+    here.status.state = state
     await until(lambda: told[-1]["state"] == "not_found")
     assert told[-1]["text"] == "not found in 0 m of driving; play the run again to search more of it"
+    await locating.close()
+
+
+async def test_the_end_is_told_after_the_last_scan_was_searched(folder, monkeypatch):
+    monkeypatch.setattr(page, "PAUSE_S", 0.01)
+    told: list[dict[str, Any]] = []
+    here = dashboard()
+    place = stand(1, side=60.0) - 30.0
+    newest = shown(2_000_000_000, place[np.hypot(*place.T) < 14.0], Pose2())
+    locate = Locating._locate
+
+    async def slow(self: Locating, stored: StoredMap, frame: Any, last: int) -> int:
+        """The run ends with a further scan while this one is searched."""
+        stamp_ns = await locate(self, stored, frame, last)
+        here.shown, here.status.state = newest, "finished"
+        return stamp_ns
+
+    monkeypatch.setattr(Locating, "_locate", slow)
+    locating = Locating(here, told.append)
+    await locating.begin("stand", folder)
+    here.shown = shown(1_000_000_000, np.array([[3.0, 2.0]]), Pose2())
+    await until(lambda: told[-1]["state"] == "found")
+    assert "not_found" not in [each["state"] for each in told]
+    await locating.close()
+
+
+async def test_two_maps_of_one_name_differ(folder):
+    told: list[dict[str, Any]] = []
+    locating = Locating(dashboard(), told.append)
+    for _ in range(2):
+        await locating.begin("stand", folder)
+    assert told[0]["serial"] != told[1]["serial"]
     await locating.close()
 
 
@@ -145,6 +181,20 @@ async def test_routes(folder):
         assert (await client.get("/api/localise")).json()["stems"] == []
 
 
+def test_what_is_neither_a_file_nor_a_folder_is_refused_without_reading_it(tmp_path):
+    os.mkfifo(tmp_path / "pipe.stems")
+    for path in (tmp_path / "pipe.stems", Path("/dev/zero")):
+        with pytest.raises(StemmapError, match="not a stored map"):
+            read_stored_map(path)
+
+
+async def test_the_home_of_an_unknown_user_is_no_folder(tmp_path):
+    async with running(Settings(recordings=tmp_path, files="any")) as (client, _):
+        answer = await client.post("/api/localise", json={"path": "~no-such-user/map"}, headers=BEARER)
+        assert answer.status_code == 409
+        assert "there is no such folder or file" in answer.text
+
+
 async def test_a_folder_or_a_file_of_the_server_is_a_stored_map(folder, tmp_path_factory):
     stored, outside = read_stored_map(folder), tmp_path_factory.mktemp("outside")
     for place in (folder.parent, outside):
@@ -159,7 +209,7 @@ async def test_a_folder_or_a_file_of_the_server_is_a_stored_map(folder, tmp_path
             return await client.post("/api/localise", json={"path": str(path)})
 
         listed = (await client.get("/api/localise/files")).json()["files"]
-        assert listed == [str(folder.parent / name) for name in ("link.stems", "stand.stems")]
+        assert listed == [str(folder.parent / "stand.stems")]
         for path in (folder, folder.parent / "stand.stems", f"file://{folder}"):
             answer = await begun(path)
             assert answer.status_code == 202, answer.text

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from app.extensions.maps.localisation import Localiser, State
+from app.extensions.maps.localisation import Localisation, Localiser, State
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.types.records import Detections
 from tests.app.extensions.maps.localisation.stands import drive, planted, stand, stored, trees_at, way
@@ -128,6 +128,7 @@ def test_stems_of_another_place_withdraw_a_fix():
         got = localiser.update(stamp, pose, trees_at(near, stamp))
     assert got.state is not State.FOUND
     assert got.withdrawn == 1
+    assert np.isnan(got.found_at)
     assert "contradicted" in got.text or got.state is State.ABSENT
 
 
@@ -206,6 +207,24 @@ def test_outside_of_the_map_the_covariance_grows_until_the_robot_is_searched_aga
     assert last_one.state is State.FOUND
     assert last_one.withdrawn == 0
     assert errors(true, last_one.T_map_odom)[0] < 0.4
+
+
+def test_a_robot_that_left_the_map_among_many_stems_was_found_in_it():
+    place, outside = stand(1, side=60.0), stand(3, density=0.08) + np.array([62.0, -20.0])
+    localiser = Localiser(stored(place))
+    poses = [Pose2(20.0 + 2.0 * k, 30.0, 0.0) for k in range(65)]
+    got = [now for _, now in drive(localiser, np.vstack([place, outside]), poses, 1)]
+    assert State.FOUND in [now.state for now in got]
+    assert State.ABSENT not in [now.state for now in got]
+    end = localiser.end()
+    assert end.state is State.NOT_FOUND
+    assert re.match(r"found at \d+ m, lost since: ", end.text)
+
+
+def test_a_fix_after_a_withdrawn_one_is_told_when_it_is_lost():
+    lost = Localisation(found_at=30.0, driven=300.0, withdrawn=1, reason="outside of the map")
+    assert lost.text == "found at 30 m, lost since: outside of the map"
+    assert Localisation(withdrawn=1).text == "not found: the stems contradicted the place that was found"
 
 
 def test_a_map_of_few_stems_is_never_said_to_be_elsewhere():
