@@ -162,7 +162,8 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     page.mouse.move(box["x"] + at["x"] + 20, box["y"] + at["y"] + 12, steps=4)
     page.mouse.up()
     new = place_of(person, moved["x"], moved["y"])
-    assert (new["x"] - at["x"], new["y"] - at["y"]) == (pytest.approx(20, abs=8), pytest.approx(12, abs=8))
+    assert new["x"] - at["x"] == pytest.approx(20.0, abs=8.0)
+    assert new["y"] - at["y"] == pytest.approx(12.0, abs=8.0)
     assert rows(person)[-1] == moved
 
     # DBH and class are typed; what is no number is refused in words.
