@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -247,9 +247,7 @@ def stand_figures(
             f"the plot has {len(every)} trees, but its observed part leads to {n / share:.0f}: it is not "
             "like the rest, and the errors of stems, basal area and volume are not known"
         )
-        for name, _, _ in totals:
-            for each in (name, f"{name}_corrected"):
-                values[each] = Estimate(values[each].value, math.nan)
+        values = _without_errors(values)
     known = share * (n / (n + lacking) if n else 1.0)
     values.update(_diameter_figures(kept, known, seen, parameters))
     values.update(_pattern(kept.position, seen, perimeter))
@@ -257,6 +255,39 @@ def stand_figures(
     return StandFigures(
         area, seen, n, missing, heights, volumes, Estimate(p, p_se), values, classes, tuple(warnings)
     )
+
+
+def compared_with_gaps(
+    figures: StandFigures, gaps: PlotTrees, extent: float, parameters: Stand
+) -> StandFigures:
+    """Return the stand parameters of a whole observed area; without the standard errors of stems, basal area
+    and volume, and with a warning, if more trees stand in its gaps than chance explains. Then trees were
+    found where the area does not count as observed, and the area is not like the stand.
+
+    Args:
+        figures: Stand parameters of the observed area.
+        gaps: Trees outside of the observed area and inside of its convex hull; added ones do not count.
+        extent: Area of the convex hull [m^2].
+        parameters: Limits of diameters.
+    """
+    share = min(figures.seen / extent, 1.0)
+    outside = int(np.count_nonzero(gaps.of_map & ~(gaps.dbh < parameters.dbh_min)))
+    if not _is_unlike(figures.trees, outside, share):
+        return figures
+    expected = figures.trees * (1.0 - share) / share
+    text = (
+        f"{outside} trees of the map stand in gaps of the observed area, where {expected:.0f} are expected: "
+        "the area is not like the stand, stems, basal area and volume may be far too small, and their errors "
+        "are not known"
+    )
+    values = _without_errors(dict(figures.values))
+    return replace(figures, values=values, warnings=(*figures.warnings, text))
+
+
+def _without_errors(values: dict[str, Estimate]) -> dict[str, Estimate]:
+    """Return figures without the standard errors of stems, basal area and volume, corrected or not."""
+    names = [each for name in ("n_ha", "g_ha", "v_ha") for each in (name, f"{name}_corrected")]
+    return values | {name: Estimate(values[name].value, math.nan) for name in names}
 
 
 def _lacking(found: Bool, p: float) -> float:

@@ -15,7 +15,15 @@ import shapely
 from app.batch.map_frame import MapFrame, read_map_frame
 from app.batch.run_folder import ByPeople, FinishedRun, read_by_people, read_run, read_seen_area
 from app.common.text import count, version
-from app.extensions.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
+from app.extensions.stand.figures import (
+    FEW_TREES,
+    FIGURES,
+    Estimate,
+    PlotTrees,
+    StandFigures,
+    combined,
+    compared_with_gaps,
+)
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plots import (
     LEAST_TREES,
@@ -124,6 +132,10 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     trees = counted_trees(run.trees, read_by_people(folder), parameters)
     chosen = list(plots) or [seen_plot(ALL, seen)]
     figures = figures_of(chosen, trees, seen, parameters)
+    if not plots:
+        hull = SamplePlot(ALL, chosen[0].shape.convex_hull)
+        gaps = trees.where(hull.contains(trees.position) & (seen.rows(trees.position) < 0))
+        figures[ALL] = compared_with_gaps(figures[ALL], gaps, hull.shape.area, parameters)
     observed = [f for f in figures.values() if f.seen > 0.0]
     if not observed:
         raise StemmapError(

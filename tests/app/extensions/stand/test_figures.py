@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.extensions.stand.figures import PlotTrees, combined, stand_figures
+from app.extensions.stand.figures import PlotTrees, combined, compared_with_gaps, stand_figures
 from app.extensions.stand.parameters import Stand
 
 INDEPENDENT = Stand(dbh_shared_sigma=0.0)
@@ -140,6 +140,31 @@ def test_more_trees_than_the_observed_part_lets_expect_make_the_errors_unknown()
     alike = figures(trees_of([0.3] * 24), area=992.0, seen=420.0, outside=trees_of([0.3] * 34))
     assert alike.values["n_ha"].se > 0.0
     assert not any("not like" in text for text in alike.warnings)
+
+
+def test_a_whole_observed_area_whose_gaps_have_more_trees_has_no_known_errors():
+    """11 trees on 388 m^2 and 48 in gaps of 512 m^2 are not one stand; as many as expected are."""
+    whole = figures(trees_of([0.3] * 11), area=388.0, detection=(0.9, 0.02))
+    compared = compared_with_gaps(whole, trees_of([0.3] * 48), 900.0, Stand())
+    for name in ("n_ha", "g_ha", "n_ha_corrected", "g_ha_corrected"):
+        assert math.isnan(compared.values[name].se)
+        assert compared.values[name].value == whole.values[name].value
+    assert any(
+        "48 trees of the map stand in gaps" in text and "15 are expected" in text
+        for text in compared.warnings
+    )
+    assert compared_with_gaps(whole, trees_of([0.3] * 15), 900.0, Stand()) is whole
+    assert compared_with_gaps(whole, trees_of([0.01] * 48), 900.0, Stand()) is whole, "thinner than counted"
+
+
+def test_drawn_stands_are_not_doubted_for_their_gaps():
+    random, doubted = np.random.default_rng(3), 0
+    for _ in range(400):
+        seen = random.random(random.poisson(60)) < 0.6
+        whole = figures(trees_of([0.3] * int(seen.sum())), area=600.0)
+        gaps = trees_of([0.3] * int((~seen).sum()))
+        doubted += compared_with_gaps(whole, gaps, 1000.0, Stand()) is not whole
+    assert doubted <= 4
 
 
 def test_trees_that_people_add_in_the_part_out_of_sight_change_no_figure():
