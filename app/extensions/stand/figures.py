@@ -23,6 +23,9 @@ NEGLIGIBLE = 0.001
 # Probability of as many trees outside of the observed part, if the parts are alike, below which they are not:
 # three standard deviations of a normal distribution, one-sided.
 UNLIKE = 0.00135
+# The same for the gaps of a whole observed area: a 95 % interval, because trees of the gaps were found
+# although they do not count as observed, so that those that were not found would add to them.
+UNLIKE_GAPS = 0.025
 FAR = 40.0  # standard deviations, beyond which a normal distribution is 0 or 1 in double precision
 
 
@@ -242,7 +245,7 @@ def stand_figures(
             detected = (1.0 - share * p) * float(np.square(of_map).sum()) + variance + fit**2
             spread = math.sqrt(detected / p**2 + (1.0 - share) * float(np.square(weights[~found]).sum()))
             values[f"{name}_corrected"] = _scaled(HECTARE / seen, float(standing @ weights), spread, assumed)
-    if _is_unlike(n, len(every) - n, share):
+    if _is_unlike(n, len(every) - n, share, UNLIKE):
         warnings.append(
             f"the plot has {len(every)} trees, but its observed part leads to {n / share:.0f}: it is not "
             "like the rest, and the errors of stems, basal area and volume are not known"
@@ -272,7 +275,7 @@ def compared_with_gaps(
     """
     share = min(figures.seen / extent, 1.0)
     outside = int(np.count_nonzero(gaps.of_map & ~(gaps.dbh < parameters.dbh_min)))
-    if not _is_unlike(figures.trees, outside, share):
+    if not _is_unlike(figures.trees, outside, share, UNLIKE_GAPS):
         return figures
     expected = figures.trees * (1.0 - share) / share
     text = (
@@ -297,15 +300,16 @@ def _lacking(found: Bool, p: float) -> float:
     return max(missed - np.count_nonzero(~found), 0.0)
 
 
-def _is_unlike(inside: int, outside: int, share: float) -> bool:
-    """Return whether more trees were found outside of the observed share of a plot than chance explains.
+def _is_unlike(inside: int, outside: int, share: float, least: float) -> bool:
+    """Return whether more trees were found outside of the observed share of a plot than chance explains: as
+    many have a probability below `least`.
 
     Trees that stand at random are in either part in proportion to its area (binomial distribution). Those
     outside that were not found would only add to them.
     """
     from scipy.stats import binom
 
-    return share < 1.0 and bool(binom.sf(outside - 1, inside + outside, 1.0 - share) < UNLIKE)
+    return share < 1.0 and bool(binom.sf(outside - 1, inside + outside, 1.0 - share) < least)
 
 
 def _scaled(scale: float, total: float, se: float, assumed: bool) -> Estimate:
@@ -316,24 +320,25 @@ def _scaled(scale: float, total: float, se: float, assumed: bool) -> Estimate:
 
 def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
     """Return a dict from the names in FIGURES to means over plots, with the standard error of the variation
-    between plots (ratio estimator). The weights are the observed areas, for `_plain` names the whole areas.
-    The error is NaN for one plot. Plots in which a value is NaN do not count; if all are NaN, so is the
-    mean."""
+    between plots (ratio estimator), at least that of the errors of the plots: a few plots can be alike by
+    chance. The weights are the observed areas, for `_plain` names the whole areas. The error is NaN for one
+    plot. Plots in which a value is NaN do not count; if all are NaN, so is the mean."""
     result = {}
     for name in FIGURES:
         rows = [
-            (f.area if name.endswith("_plain") else f.seen, f.values[name].value)
+            (f.area if name.endswith("_plain") else f.seen, *f.values[name])
             for f in plots.values()
             if math.isfinite(f.values[name].value)
         ]
         if not rows:
             result[name] = Estimate()
             continue
-        weight, value = np.array(rows).T
+        weight, value, own = np.array(rows).T
         share = weight / weight.sum()
         mean, k = float(share @ value), len(rows)
-        se = math.sqrt(k / (k - 1) * float(np.square(share * (value - mean)).sum())) if k > 1 else math.nan
-        result[name] = Estimate(mean, se)
+        within = math.sqrt(float(np.square(share * np.nan_to_num(own)).sum()))
+        between = math.sqrt(k / max(k - 1, 1) * float(np.square(share * (value - mean)).sum()))
+        result[name] = Estimate(mean, max(between, within) if k > 1 else math.nan)
     return result
 
 
