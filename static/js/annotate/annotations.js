@@ -203,7 +203,7 @@ async function turn(where, word, subjects) {
   const single = name === "annotation" && !others.length && parts.length === 1;
   const tree = single ? nearest(trees(), (each) => distance(each, row), state.annotations.same_thing_m) : null;
   const what = parts.map(([each, changes]) => count(changes.length, each)).join(", ") || "nothing changed";
-  showNews(`${word}: ${what}${tree ? ` of tree ${tree.number} (${row.kind})` : ""}.`);
+  showNews(`${word}: ${tree ? `tree ${tree.number} (${row.kind})` : what}.`);
   if (tree) select(tree.number);
 }
 
