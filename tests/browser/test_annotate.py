@@ -504,11 +504,12 @@ def test_an_answer_counts_only_while_the_card_is_in_view(person: Dashboard):
     page.get_by_role("button", name="Fit").click()
     person.drawn()
     scroll = "document.querySelector('#panel-annotate').scrollTop = 1e4"
-    for key in ("y", "n", "s", "Shift+P"):
+    for number, key in enumerate(("y", "n", "s", "Shift+P"), start=1):
         page.evaluate(scroll)
         expect(page.locator("#review-title")).not_to_be_in_viewport()
         canvas.press(key)
-        text = f"Not counted: the card of tree {first['number']} was out of view."
+        times = f" ({number} times)" if number > 1 else ""
+        text = f"Not counted{times}: the card of tree {first['number']} was out of view."
         expect(refused).to_have_text(text)
         expect(page.locator("#problem")).to_contain_text(text)
         expect(page.locator("#review-title")).to_be_in_viewport()
