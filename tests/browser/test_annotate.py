@@ -421,6 +421,7 @@ def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard)
     expect(title).to_have_text(f"Tree {first}")
     canvas.press("Control+z")
     expect(history.get_by_role("button").nth(1)).to_have_text(f"{second} pole")
+    expect(page.locator("#problem")).to_contain_text(f"Undone: tree {second} (pole).")
     canvas.press("Control+z")  # the answer before, which makes its tree open again
     expect(history.get_by_role("button")).to_have_text(["Previous (R)", f"{second} pole", f"{first} tree"])
     assert person.errors == []
