@@ -25,6 +25,7 @@ from pipeline.tracking.observation import (
     seen_sides,
     shape_sigma,
 )
+from pipeline.tracking.tracker import SHARED_SIGMA
 from tests.pipeline.strategies import detections, seeds, track
 
 FOREST = preset("forest").tracking
@@ -83,7 +84,7 @@ def test_without_noise_of_the_velocity_the_state_is_the_mean_of_the_views():
     np.testing.assert_allclose(trees.position, [views.mean(axis=0)], atol=1e-9)
     np.testing.assert_allclose(t.tracks.P[0, :2, :2], np.eye(2) * 0.05**2 / 40, rtol=1e-6)
     # What is told to people does not shrink for ever: views of a trunk share an error.
-    assert 0.005 < np.sqrt(trees.covariance[0, 0, 0]) < 0.02
+    assert SHARED_SIGMA < np.sqrt(trees.covariance[0, 0, 0]) < 0.03
 
 
 @given(seeds)
