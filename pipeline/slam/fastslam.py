@@ -623,10 +623,9 @@ class FastSlam:
     def _with_first_views(
         self, state: SlamState, scans: tuple[ScanDetections, ...]
     ) -> tuple[KeyframeGraph, tuple[ScanDetections, ...]]:
-        """Return the graph whose only keyframe has also the detections of the scans that are nearer to it
-        than to the newest scan, and the other scans, of which there is one at least if there are scans. The
-        keyframe fixes the frame of the map, so that the noise of a single scan would move and turn the whole
-        map."""
+        """Return the graph with the scans near its only keyframe added to it, and the other scans."""
+        # This keyframe fixes the frame of the map: errors of one scan would move and rotate the whole map.
+        # The last scan is left to the second keyframe.
         first = state.graph.keyframes[0]
         near = tuple(s for s in scans[:-1] if s.distance - first.distance < state.distance - s.distance)
         shown = np.array([first.scan, *(s.scan for s in near)])

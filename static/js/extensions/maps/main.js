@@ -16,7 +16,7 @@ let stems = [], stemsOf = 0; // [x, y] of the stored map in its frame, and its s
 
 async function show(message) {
   now = message;
-  if (now.state !== "idle" && (stemsOf !== now.serial || now.state === "searching")) { // a server that started again counts anew
+  if (now.state !== "idle" && (stemsOf !== now.serial || now.state === "searching")) { // serial numbers restart with the server
     stemsOf = now.serial;
     stems = [];
     const got = await attempted(() => get("/api/localise"));
