@@ -8,6 +8,7 @@ segmentation; the following stages are the same for them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -18,10 +19,10 @@ import numpy as np
 
 from pipeline.classification import view_by_direction
 from pipeline.config import Parameters
-from pipeline.config.stages import Acquisition, Detection
+from pipeline.config.stages import Acquisition, Detection, Ground
 from pipeline.detection.cluster_shape import describe_stems, no_lift
 from pipeline.detection.clustering import cluster
-from pipeline.detection.free_space import clear_range
+from pipeline.detection.free_space import clear_range, seen_range
 from pipeline.detection.obstacles import find_clearance
 from pipeline.detection.truncation import is_truncated
 from pipeline.detection.verdicts import classify_clusters, detections
@@ -81,7 +82,9 @@ class SegmentedScan:
     Attributes:
         clusters: Clusters without verdicts.
         heights: Mean height of each cluster above the ground, shape (K,) [m]; None if no ground is in view.
-        free: Free range by direction (see `pipeline.detection.free_space`).
+        free: Free range by direction (see `pipeline.detection.free_space.clear_range`).
+        seen: Range up to which stems are in view, by direction (see
+            `pipeline.detection.free_space.seen_range`).
         column_input: Input of the voxel columns; None for scans that do not update them or do not show the
             ground.
         terrain: Ground that updates the terrain map; None likewise.
@@ -94,12 +97,18 @@ class SegmentedScan:
     clusters: Clusters
     heights: Float | None
     free: Float
+    seen: Float
     sensor_offset: Float
     column_input: ColumnInput | None
     terrain: Terrain | None
     warnings: tuple[str, ...]
     counts: dict[str, int]
     clearance: Clearance | None = None
+
+    @property
+    def view(self) -> Float:
+        """`free` and `seen`, shape (2, BINS) [m]."""
+        return np.stack([self.free, self.seen])
 
 
 class DetectionResult(NamedTuple):
@@ -197,6 +206,7 @@ def _segment_points(
 
     with timer("free view"):
         free = clear_range(raw, filtered, sensor_offset)
+        view = _seen_range(boxed, height, terrain, sensor_offset, p.ground, free)
 
     with timer("obstacles"):
         near = acquire_near(step, T_base_lidar, p.acquisition)
@@ -210,6 +220,7 @@ def _segment_points(
         clusters=described,
         heights=None if seen is None else heights_of_places(described.centroid, seen.height),
         free=free,
+        seen=view,
         sensor_offset=sensor_offset,
         column_input=_column_input(raw, boxed, height, seen, sensor_offset, sensor)
         if p.classification.method == "columns" and step.is_due(interval)
@@ -234,6 +245,24 @@ def _lift(terrain: Terrain, height: float, centroid: Float) -> Float:
     """Return how far the height above the ground `height` [m] is above each centroid, shape (K,) [m];
     `centroid` are the centroids of clusters, level sensor frame, shape (K, 3) [m]."""
     return height - heights_of_places(centroid, terrain.height)
+
+
+def _seen_range(
+    boxed: Float32,
+    height: Float32 | None,
+    terrain: Terrain | None,
+    sensor_offset: Float,
+    parameters: Ground,
+    free: Float,
+) -> Float:
+    """Return the `seen_range` of the points in the box with their heights; without heights, which no band
+    limits then, the farthest points end it."""
+    if height is None or terrain is None:
+        everything = np.zeros(len(boxed), np.float32)
+        return seen_range(boxed, everything, sensor_offset, 0.0, (-math.inf, math.inf), free)
+    sensor_height = -scan_ground.ground_at(terrain.height, 0.0, 0.0)
+    band = (parameters.height_min, parameters.height_max)
+    return seen_range(boxed, height, sensor_offset, sensor_height, band, free)
 
 
 def _column_input(
@@ -295,6 +324,7 @@ def _segment_stems(
         clusters=clusters,
         heights=None,
         free=free,
+        seen=free,
         sensor_offset=sensor_offset,
         column_input=None,
         terrain=None,

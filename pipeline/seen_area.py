@@ -1,4 +1,4 @@
-"""The observed area: a raster with the nearest free view of each cell by a drive, or what a cloud covers."""
+"""The observed area: a raster with the nearest view of each cell by a drive, or what a cloud covers."""
 
 from __future__ import annotations
 
@@ -34,14 +34,17 @@ class SeenArea:
         cell: Side of the square cells [m].
         place: Indices of the cell along x and y of the map, int64, shape (K, 2); the cell spans from place *
             cell to (place + 1) * cell [m].
-        nearest: Distance of the nearest free view [m]; NaN if unknown, as for a whole cloud.
-        views: Number of recorded scans with a free view of the cell, int64; 0 if unknown.
+        nearest: Distance of the nearest view [m]; NaN if unknown, as for a whole cloud.
+        views: Number of recorded scans with a view of the cell, int64; 0 if unknown.
+        clear: Whether one of them is free at all heights of the stems, so that no undergrowth is on the way;
+            False if unknown.
     """
 
     cell: float
     place: Int
     nearest: Float
     views: Int
+    clear: Bool
 
     @property
     def centres(self) -> Float:
@@ -60,11 +63,11 @@ class SeenArea:
 
     def where(self, keep: Bool) -> SeenArea:
         """Return the area with the rows for which `keep`, shape (K,), is true."""
-        return SeenArea(self.cell, self.place[keep], self.nearest[keep], self.views[keep])
+        return SeenArea(self.cell, self.place[keep], self.nearest[keep], self.views[keep], self.clear[keep])
 
     def closed(self) -> SeenArea:
         """Return the area with gaps up to GAP closed: stems and the undergrowth around them hide ground. A
-        cell of a gap has the distance and the views of the nearest cell."""
+        cell of a gap has the distance and the views of the nearest cell, and is not clear."""
         from scipy.ndimage import binary_closing, distance_transform_edt
 
         if not len(self.place):
@@ -76,12 +79,13 @@ class SeenArea:
         place = np.argwhere(binary_closing(row >= 0, iterations=steps))
         nearest = distance_transform_edt(row < 0, return_distances=False, return_indices=True)
         of = row[tuple(nearest[:, place[:, 0], place[:, 1]])]
-        return SeenArea(self.cell, place + low, self.nearest[of], self.views[of])
+        clear = self.clear[of] & (row[tuple(place.T)] >= 0)
+        return SeenArea(self.cell, place + low, self.nearest[of], self.views[of], clear)
 
     def joined(self, other: SeenArea, T_map_other: Pose2 | None = None) -> SeenArea:
         """Return the union with the area of another drive, which has cells of the same size (not checked). A
         cell in both areas has the smaller distance, or the known one if the other is NaN, and the sum of the
-        views.
+        views. It is clear if it is clear in one of them.
 
         Args:
             other: The other area.
@@ -89,35 +93,42 @@ class SeenArea:
                 same.
         """
         if T_map_other is None:
-            place, nearest, views = other.place, other.nearest, other.views
+            place, nearest, views, clear = other.place, other.nearest, other.views, other.clear
         else:
             # Nine points per cell leave no hole between rotated cells.
             steps = (np.arange(3) + 0.5) / 3.0
             within = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
             points = (other.place[:, None, :] + within).reshape(-1, 2) * other.cell
             place = np.floor(T_map_other.apply(points) / self.cell).astype(np.int64)
-            nearest, views = np.repeat(other.nearest, len(within)), np.repeat(other.views, len(within))
-            place, nearest, views = _grouped(place, nearest, views, np.maximum)
+            row = np.repeat(np.arange(len(other.place)), len(within))
+            place, nearest, views, clear = _grouped(
+                place, other.nearest[row], other.views[row], other.clear[row], np.maximum
+            )
         both = (
             np.concatenate([self.place, place]),
             np.concatenate([self.nearest, nearest]),
             np.concatenate([self.views, views]),
+            np.concatenate([self.clear, clear]),
         )
         return SeenArea(self.cell, *_grouped(*both, np.add))
 
 
-def _grouped(place: Int, nearest: Float, views: Int, of_views: np.ufunc) -> tuple[Int, Float, Int]:
-    """Return cells, distances [m] and views with one row per cell, sorted by cell, with the smallest distance
-    (NaN if all are NaN) and the views combined by `of_views`, beginning with 0.
+def _grouped(
+    place: Int, nearest: Float, views: Int, clear: Bool, of_views: np.ufunc
+) -> tuple[Int, Float, Int, Bool]:
+    """Return cells, distances [m], views and whether they are clear with one row per cell, sorted by cell,
+    with the smallest distance (NaN if all are NaN), the views combined by `of_views`, beginning with 0, and
+    clear if one row is.
 
     Args:
         place: Cells, shape (N, 2), which may repeat; N may be 0.
-        nearest: Distance of a free view of each cell, shape (N,) [m].
+        nearest: Distance of a view of each cell, shape (N,) [m].
         views: Number of views of each cell, shape (N,).
+        clear: Whether each cell is clear, shape (N,).
         of_views: np.add or np.maximum.
     """
     if not len(place):
-        return place, nearest, views
+        return place, nearest, views, clear
     low = place.min(axis=0)
     span = int(place[:, 1].max() - low[1]) + 1
     # One number per cell, in the order of its rows: sorting numbers is much faster than sorting rows.
@@ -127,19 +138,22 @@ def _grouped(place: Int, nearest: Float, views: Int, of_views: np.ufunc) -> tupl
     np.fmin.at(least, row.ravel(), nearest)
     combined = np.zeros(len(cells), np.int64)
     of_views.at(combined, row.ravel(), views)
-    return cells, least, combined
+    any_clear = np.zeros(len(cells), np.bool_)
+    any_clear[row.ravel()[clear]] = True
+    return cells, least, combined, any_clear
 
 
 def covered_area(points: Float) -> SeenArea:
     """Return the area that a cloud covers seen from above: cells with a point at any height, with gaps up to
-    GAP closed. Distances and numbers of views are unknown.
+    GAP closed. Distances, numbers of views and what is clear are unknown.
 
     Args:
         points: Positions x, y, shape (N, 2) [m], closer to one another than CELL. They count to the
             millimetre, so that the offset of a file does not change a cell.
     """
     place = np.unique(np.floor(np.round(points, 3) / CELL).astype(np.int64), axis=0)
-    return SeenArea(CELL, place, np.full(len(place), np.nan), np.zeros(len(place), np.int64)).closed()
+    n = len(place)
+    return SeenArea(CELL, place, np.full(n, np.nan), np.zeros(n, np.int64), np.zeros(n, np.bool_)).closed()
 
 
 class ViewSelection:
@@ -172,39 +186,42 @@ class ViewSelection:
 
 
 class SeenRecorder:
-    """Collects the free range of scans along a drive. Poses are applied at the end, so that corrections of
+    """Collects the views of scans along a drive. Poses are applied at the end, so that corrections of
     the path also move what was observed."""
 
     def __init__(self) -> None:
-        self._free: dict[int, Float32] = {}
+        self._views: dict[int, Float32] = {}
 
-    def add(self, stamp_ns: int, free: Float) -> None:
+    def add(self, stamp_ns: int, view: Float) -> None:
         """Record a scan, in place of one of the same time.
 
         Args:
             stamp_ns: Time of the scan [ns].
-            free: Free range by direction in the base frame, shape (BINS,) [m], see
-                `pipeline.detection.free_space.clear_range`; copied, limited to RANGE.
+            view: Free range, and range up to which stems are in view, by direction in the base frame, shape
+                (2, BINS) [m], see `pipeline.front_end.SegmentedScan.view`; copied, limited to RANGE.
         """
-        self._free[stamp_ns] = np.minimum(free, RANGE).astype(np.float32)
+        self._views[stamp_ns] = np.minimum(view, RANGE).astype(np.float32)
 
     def area(self, path: Path) -> SeenArea:
         """Return the observed area: a scan observes the cells whose centres are at most RANGE away and at
-        most INTO behind the end of its free range. Without scans it has no cells.
+        most INTO behind the end of the range up to which stems are in view. Those at most INTO behind the
+        end of the free range are clear. Without scans it has no cells.
 
         Args:
             path: Final path; recorded scans whose stamps it does not have are left out.
         """
-        area = SeenArea(CELL, np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0, np.int64))
+        none = np.zeros(0, np.int64)
+        area = SeenArea(CELL, np.zeros((0, 2), np.int64), np.zeros(0), none, none.astype(np.bool_))
         cells: list[Int] = []
         distance: list[Float] = []
+        clear: list[Bool] = []
         rows = 0
         half = math.ceil(RANGE / CELL) + 1
         side = np.arange(-half, half + 1)
         grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(*grid.T) * CELL <= RANGE + CELL]
         row_of = {stamp: row for row, stamp in enumerate(path.stamp_ns.tolist())}
-        for stamp, free in list(self._free.items()):  # another thread may add scans
+        for stamp, (free, in_view) in list(self._views.items()):  # another thread may add scans
             row = row_of.get(stamp)
             if row is None:
                 continue
@@ -212,20 +229,23 @@ class SeenRecorder:
             place = grid + np.floor(np.array([pose.x, pose.y]) / CELL).astype(np.int64)
             local = pose.inverse().apply((place + 0.5) * CELL)
             reach = np.hypot(*local.T)
-            seen = (reach <= free[direction_bins(local, len(free))] + INTO) & (reach <= RANGE)
+            bins = direction_bins(local, len(free))
+            seen = (reach <= in_view[bins] + INTO) & (reach <= RANGE)
             cells.append(place[seen])
             distance.append(reach[seen])
+            clear.append((reach <= free[bins] + INTO)[seen])
             rows += len(cells[-1])
             if rows >= max(ROWS_MOST, len(area.place)):  # each time the whole area is sorted
-                area = _with_views(area, cells, distance)
-                cells, distance, rows = [], [], 0
-        return _with_views(area, cells, distance)
+                area = _with_views(area, cells, distance, clear)
+                cells, distance, clear, rows = [], [], [], 0
+        return _with_views(area, cells, distance, clear)
 
 
-def _with_views(area: SeenArea, cells: list[Int], distance: list[Float]) -> SeenArea:
-    """Return an area with further views: the cells of each, shape (K, 2), and their distances, shape (K,)
-    [m]."""
+def _with_views(area: SeenArea, cells: list[Int], distance: list[Float], clear: list[Bool]) -> SeenArea:
+    """Return an area with further views: the cells of each, shape (K, 2), their distances, shape (K,) [m],
+    and whether they are clear, shape (K,)."""
     if not cells:
         return area
     place, nearest = np.concatenate(cells), np.concatenate(distance)
-    return area.joined(SeenArea(CELL, place, nearest, np.ones(len(place), np.int64)))
+    once = np.ones(len(place), np.int64)
+    return area.joined(SeenArea(CELL, place, nearest, once, np.concatenate(clear)))

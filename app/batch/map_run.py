@@ -36,7 +36,6 @@ from app.common.timers import Stopwatch
 from app.sources.request import ChosenOdometry, with_odometry
 from app.store.forests import mapper_of
 from pipeline.config import Parameters
-from pipeline.detection.free_space import clear_range
 from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import MapScores, PathError, path_error
 from pipeline.io.checkpoints.saved_map import SavedMap
@@ -253,11 +252,12 @@ def _map_scans(
         _use_revisions(plan, mapper, step.index)
         # The first scan loads the kernels, which takes much longer than mapping.
         with stopwatch.aside() if frame is None else stopwatch.whole_scan():
-            frame = mapper.process(step)
+            scan = mapper.segment(step)
+            frame = mapper.process(step, scan)
         if plan.on_frame is not None:
             plan.on_frame(frame, mapper)
         if views.take(frame.estimate.T_map_base):
-            seen.add(frame.stamp_ns, clear_range(frame.raw, frame.filtered, frame.sensor_offset))
+            seen.add(frame.stamp_ns, scan.view)
         start_ns = frame.stamp_ns if start_ns is None else start_ns
         files.add(frame, start_ns)
         begun.tally.add(frame)

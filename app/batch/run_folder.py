@@ -153,7 +153,8 @@ def read_seen_area(folder: FilePath) -> SeenArea | None:
         return None
     c = _columns(file, SEEN_COLUMNS)
     place = np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / CELL).astype(np.int64)
-    return SeenArea(CELL, place, c["nearest_m"], np.nan_to_num(c["views"]).astype(np.int64))
+    views = np.nan_to_num(c["views"]).astype(np.int64)
+    return SeenArea(CELL, place, c["nearest_m"], views, c["clear"] > 0.0)
 
 
 def read_terrain(folder: FilePath) -> Float:

@@ -340,8 +340,8 @@ class Dashboard:
                 await self._show(message)
             case protocol.Unmapped(run=run, frame=frame) if run == self.run and self.shown is None:
                 self._show_scene(frame, np.zeros((0, 4)))
-            case protocol.View(run=run, stamp_ns=stamp_ns, free=free) if run == self.run:
-                self.seen.add(stamp_ns, free)
+            case protocol.View(run=run, stamp_ns=stamp_ns, view=view) if run == self.run:
+                self.seen.add(stamp_ns, view)
             case protocol.Answer():
                 self.worker_client.take(message)
             case protocol.Remapped(run=run, changes=changes) if run == self.run:

@@ -442,8 +442,8 @@ class WorkerLoop:
         scans behind, which are 0 unless the run plays. Before the preparation of a run that plays or seeks,
         the state is "starting"; a seek that takes long is named in `detail`."""
         run = self._session.run
-        for stamp_ns, free in () if run is None else run.take_views():
-            self._put(protocol.View(self._run, stamp_ns, free))
+        for stamp_ns, view in () if run is None else run.take_views():
+            self._put(protocol.View(self._run, stamp_ns, view))
         now = self._clock()
         if self._session.pace not in ("idle", "live") and not self._prepared:
             # Nothing plays yet: the first scan is read and the kernels are compiled before.

@@ -528,12 +528,12 @@ class View(msgspec.Struct, frozen=True, tag="view"):
     Attributes:
         run: As in `Shown`.
         stamp_ns: Time of the scan [ns].
-        free: Free range by azimuth in the base frame, shape (bins,) [m].
+        view: View of the scan, see `SegmentedScan.view`.
     """
 
     run: int
     stamp_ns: int
-    free: Float
+    view: Float
 
 
 class Unmapped(msgspec.Struct, frozen=True, tag="unmapped"):

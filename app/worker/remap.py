@@ -257,8 +257,8 @@ class RunMap:
         clusters: Clusters of all scans.
         counts: Counts of all scans.
         course: Quantities of all scans, see `read_quantities`, with `time_s` [s since the first scan].
-        views: Time [ns] and free range by direction [m], see `SegmentedScan.free`, of the scans that
-            `ViewSelection` takes for the observed area, in the order of their times.
+        views: Time [ns] and view, see `SegmentedScan.view`, of the scans that `ViewSelection` takes for the
+            observed area, in the order of their times.
     """
 
     def __init__(
@@ -284,14 +284,14 @@ class RunMap:
         self._view_poses: list[Pose2] = []
         self._start_ns, self._time_s = start_ns, -math.inf
 
-    def add(self, frame: Frame, free: Float, times: Mapping[str, float]) -> None:
+    def add(self, frame: Frame, view: Float, times: Mapping[str, float]) -> None:
         """Add the results of the scan that was mapped last. If the run went back, the entries of this scan
         replace earlier ones, and `history` and `clusters` lose those of later scans; stored frames and views
         stay. A tree keeps the time of its first confirmation, unless the run went back to or before it.
 
         Args:
             frame: The results.
-            free: Free range of the scan by direction, shape (BINS,) [m].
+            view: View of the scan, see `SegmentedScan.view`.
             times: Times of mapping the scan for `course`, see `stage_times`; empty if they are unknown.
         """
         time_s = self.add_trees(frame.index, frame.stamp_ns, frame.trees)
@@ -300,14 +300,14 @@ class RunMap:
         self.course.record(frame.index, {"time_s": time_s, **read_quantities(frame), **times})
         if self.frames is not None:
             self.frames.put(frame, self.mapper.path, time_s, self.confirmed(frame.trees))
-        self._add_view(frame.stamp_ns, frame.estimate.T_map_base, free)
+        self._add_view(frame.stamp_ns, frame.estimate.T_map_base, view)
 
-    def _add_view(self, stamp_ns: int, T_map_base: Pose2, free: Float) -> None:
+    def _add_view(self, stamp_ns: int, T_map_base: Pose2, view: Float) -> None:
         """Add the view of a scan to `views` if it is the newest one and selected."""
         if stamp_ns > self._newest_ns:
             self._newest_ns = stamp_ns
             if self._view_selection.take(T_map_base):
-                self.views.append((stamp_ns, free))
+                self.views.append((stamp_ns, view))
                 self._view_poses.append(T_map_base)
 
     def add_trees(self, index: int, stamp_ns: int, trees: Trees) -> float:
@@ -340,9 +340,9 @@ class RunMap:
             self.frames.close()
             self.frames = known.frames.with_trees(scans, OtherTrees(by_scan, dict(self.confirmed_s)))
         newest_ns = int(self.mapper.path.stamp_ns[-1]) if scans else -1
-        for (stamp_ns, free), pose in zip(known.views, known._view_poses, strict=True):
+        for (stamp_ns, view), pose in zip(known.views, known._view_poses, strict=True):
             if stamp_ns <= newest_ns:
-                self._add_view(stamp_ns, pose, free)
+                self._add_view(stamp_ns, pose, view)
         self._newest_ns = newest_ns
 
     def confirmed(self, trees: Trees) -> Float:
@@ -440,7 +440,7 @@ class Remapping:
             snapshots.expect(until)
             if snapshots.is_due(rerun.done):
                 snapshots.offer(rerun.done, rerun.mapper.snapshot())
-            self.map.add(rerun.map_next(), rerun.free, {})
+            self.map.add(rerun.map_next(), rerun.view, {})
         return rerun.done == until
 
     def finish(self) -> RunMap:

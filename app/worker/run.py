@@ -276,7 +276,7 @@ class Run:
             mapper.parameters, self._cache = wanted, self._caches.of(wanted)
         self._broken = True
         with self.stopwatch.whole_scan() as times:
-            frame, free = self._process(mapper, step, hurried=hurried)
+            frame, view = self._process(mapper, step, hurried=hurried)
         spent = {} if self.is_bare or TOTAL not in times else stage_times(times)
         if step.index == len(self._odometry_xy):
             place = frame.T_odom_base.x, frame.T_odom_base.y
@@ -288,7 +288,7 @@ class Run:
         self._step, self.current = step, step.index
         self.has_intensity = bool(self.has_intensity) or step.scan.reflectance is not None
         self.graph, self.tree_landmarks = mapper.graph, mapper.tree_landmarks
-        self._map.add(frame, free, spent)
+        self._map.add(frame, view, spent)
         self.confirmed_s = self._map.confirmed(frame.trees)
         return self.frame
 
@@ -313,7 +313,7 @@ class Run:
         return msgspec.structs.replace(shown, frame=frame, confirmed_s=confirmed_s, reflectance=reflectance)
 
     def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> tuple[Frame, Float]:
-        """Return the result of a step and the free range of its scan, and cache the segmented scan.
+        """Return the result of a step and the view of its scan, and cache the segmented scan.
 
         Args:
             mapper: The mapper.
@@ -324,7 +324,7 @@ class Run:
         self.is_bare = cached is not None
         scan = mapper.segment(step) if cached is None else cached[1]
         self._cache.put(step, scan)
-        return mapper.process(step, scan), scan.free
+        return mapper.process(step, scan), scan.view
 
     def take_views(self) -> list[tuple[int, Float]]:
         """Return the `RunMap.views` of the present map that were not returned before."""

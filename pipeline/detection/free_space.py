@@ -60,6 +60,45 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
 
 
 @compiled
+def seen_range(
+    points: Float32,
+    height: Float32,
+    sensor_offset: Float,
+    sensor_height: float,
+    band: tuple[float, float],
+    free: Float,
+) -> Float:
+    """Return how far from the base stems are in view at some height, by direction in the base frame, shape
+    (BINS,), in the order of `direction_bin` [m].
+
+    This is the free range or, if it is longer, the length over which the farthest ray of the direction is in
+    the band of heights: undergrowth hides a stem only as high as it grows. The ground is taken as plane below
+    a ray.
+
+    Args:
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
+        height: Their heights above the ground, float32, shape (N,) [m].
+        sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
+        sensor_height: Height of the sensor above the ground [m].
+        band: Lowest and highest height at which stems are looked for [m].
+        free: Free range by direction [m], see `clear_range`.
+    """
+    low, high = band
+    seen = free.copy()
+    for i in range(points.shape[0]):
+        part = 1.0  # of the ray, up to where it leaves the band
+        if height[i] > high:
+            part = (high - sensor_height) / (height[i] - sensor_height)
+        elif height[i] < low:
+            part = (sensor_height - low) / (sensor_height - height[i])
+        if part > 0.0:  # else the ray is outside of the band from the sensor on
+            x, y = part * points[i, 0] + sensor_offset[0], part * points[i, 1] + sensor_offset[1]
+            k = direction_bin(x, y, BINS)
+            seen[k] = max(seen[k], np.sqrt(x * x + y * y))
+    return seen
+
+
+@compiled
 def widest_gap(bins: NDArray[np.uint16]) -> tuple[int, int]:
     """Return the first bin and the length of the longest run of bins without a return, which may extend over
     the seam; length 0 for an empty scan. `bins` are the bins of the returns, see `directions`, shape (N,)."""

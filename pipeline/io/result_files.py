@@ -27,7 +27,7 @@ BY_PEOPLE = "by_people.csv"
 #: States of a tree in the review by a person.
 OPEN, CONFIRMED, REJECTED, SKIPPED = REVIEWS = ("open", "confirmed", "rejected", "skipped")
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
-SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
+SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views", "clear")
 
 
 def number_text(value: float, digits: int) -> str:
@@ -158,12 +158,20 @@ def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
 
 def seen_text(area: SeenArea) -> str:
     """Return the text of seen.csv: the observed cells in the order of `area`; x and y are their centres. The
-    distance of the nearest free view and the number of views are empty where unknown."""
+    distance of the nearest view and the number of views are empty where unknown; clear is 0 or 1."""
     return csv_text(
         SEEN_COLUMNS,
         (
-            [number_text(x, 3), number_text(y, 3), number_text(nearest, 2), str(views) if views else ""]
-            for (x, y), nearest, views in zip(area.centres, area.nearest, area.views, strict=True)
+            [
+                number_text(x, 3),
+                number_text(y, 3),
+                number_text(nearest, 2),
+                str(views) if views else "",
+                str(int(clear)),
+            ]
+            for (x, y), nearest, views, clear in zip(
+                area.centres, area.nearest, area.views, area.clear, strict=True
+            )
         ),
     )
 

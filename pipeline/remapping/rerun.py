@@ -184,7 +184,7 @@ class Rerun:
 
     Attributes:
         done: Number of scans that are mapped.
-        free: Free range by direction of the last one, see `SegmentedScan.free`; empty before the first.
+        view: View of the last one, see `SegmentedScan.view`; empty before the first.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class Rerun:
         """Prepare a rerun; nothing is read."""
         self.mapper = mapper
         self.done = done
-        self.free: Float = np.zeros(0)
+        self.view: Float = np.zeros((2, 0))
         self._cache, self._reread, self._segment_steps = cache, reread, segment_steps
         self._segmented: Iterator[tuple[Step, SegmentedScan]] | None = None
 
@@ -214,7 +214,7 @@ class Rerun:
         step, scan = self._cache.read(self.done) or self._read_again(self.done)
         frame = self.mapper.process(step, scan)
         self.done += 1
-        self.free = scan.free
+        self.view = scan.view
         return frame
 
     def require(self, scans: int) -> None:

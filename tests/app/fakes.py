@@ -123,6 +123,7 @@ class FakeMapper:
             clusters,
             None,
             np.zeros(BINS),
+            np.zeros(BINS),
             np.zeros(3),
             None,
             None,

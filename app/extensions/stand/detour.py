@@ -72,7 +72,7 @@ def shortest_detour(
         sides: Sectors from which each tree without a diameter was seen, see `Trees.sides`; None for the
             others.
         arc: Arc that a diameter needs [rad].
-        seen: The observed area; the way stays in it.
+        seen: The observed area; the way stays in its clear cells.
         width: Width of the robot with its lateral clearance [m].
     """
     radius = np.where(np.isfinite(radius), radius, UNKNOWN_RADIUS)
@@ -111,6 +111,7 @@ def _walkable(position: Float, radius: Float, seen: SeenArea, width: float) -> t
     from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
 
+    seen = seen.where(seen.clear)  # not through undergrowth
     centres = seen.centres
     if len(position) and len(centres):
         clear = radius + 0.5 * width + seen.cell * math.sqrt(0.5)  # from anywhere in the cell

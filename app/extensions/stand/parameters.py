@@ -26,10 +26,10 @@ class Stand(Stage):
     """Number of the thickest trees per hectare that give the dominant diameter."""
 
     reach: float = number(15.0, "Reach", "m", 1.0, 30.0, 0.5)
-    """An area counts as observed up to this distance from its nearest free view."""
+    """An area counts as observed up to this distance from its nearest view."""
 
     views_min: int = count(2, "Minimum views", "", 1, 100)
-    """Number of scans, half a metre of path apart, with a free view of an observed cell."""
+    """Number of scans, half a metre of path apart, with a view of an observed cell."""
 
     correction: Literal["half_normal", "none"] = choice("half_normal", "Correction")
     """half_normal: detection probability over distance; none: every tree in view is found."""

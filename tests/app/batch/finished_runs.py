@@ -51,7 +51,7 @@ def write_run(folder, position, dbh, *, dbh_sigma=0.01, side=20.0, seen=True, nu
     path = Path(np.arange(41) * 10**9, steps, steps, np.full(41, np.pi / 4), np.full(41, 0.01))
     cells = np.argwhere(np.ones((round(side / CELL),) * 2, np.bool_))
     nearest = np.abs((cells[:, 0] - cells[:, 1]) * CELL) / np.sqrt(2.0)
-    area = SeenArea(CELL, cells, nearest, np.full(len(cells), 5))
+    area = SeenArea(CELL, cells, nearest, np.full(len(cells), 5), np.ones(len(cells), np.bool_))
     rows = [[f"{x:.3f}", f"{y:.3f}", f"{0.1 * x:.3f}", "", ""] for x, y in area.centres]
     source: dict[str, object] = {"uri": "sim:stand", "kind": "simulated", "sha256": "00"}
     if cloud_crs is not None:

@@ -70,8 +70,8 @@ def test_the_observed_area_is_that_of_the_command(session: Session, tmp_path: Fi
     assert session.run is not None
     assert session.shown.path is not None
     recorder = SeenRecorder()
-    for stamp_ns, free in session.run.take_views():
-        recorder.add(stamp_ns, free)
+    for stamp_ns, view in session.run.take_views():
+        recorder.add(stamp_ns, view)
     stand_at(session, 20)
     assert session.run.take_views() == []
     stand_at(session, 69)
@@ -204,8 +204,8 @@ def test_the_page_and_the_command_line_give_the_same_files(session: Session, tmp
     while session.pace == "hurry":
         session.work()
         assert session.run is not None
-        for stamp_ns, free in session.run.take_views():
-            seen.add(stamp_ns, free)
+        for stamp_ns, view in session.run.take_views():
+            seen.add(stamp_ns, view)
     assert session.run is not None
     last = session.run.current
     for index in (20, last):  # the counts are those of the shown scan, also after the run went back

@@ -153,7 +153,6 @@ def _driven_on(first: SimulatedRun, corners: Float | None, length: float) -> Sim
 def _map(run: SimulatedRun) -> _Mapped:
     """Map a run, and record the area that its scans observed."""
     from pipeline.config import preset
-    from pipeline.detection.free_space import clear_range
     from pipeline.geometry.columns import rows_of
     from pipeline.geometry.poses import Pose2
     from pipeline.io.readers.simulated import SimulatedSource
@@ -166,9 +165,10 @@ def _map(run: SimulatedRun) -> _Mapped:
     mapper = Mapper(preset("forest"), sensor=about.sensor, T_base_lidar=about.T_base_lidar, seed=0)
     seen, views, frame = SeenRecorder(), ViewSelection(), None
     for step in steps(source.records()):
-        frame = mapper.process(step)
+        scan = mapper.segment(step)
+        frame = mapper.process(step, scan)
         if views.take(frame.estimate.T_map_base):
-            seen.add(frame.stamp_ns, clear_range(frame.raw, frame.filtered, frame.sensor_offset))
+            seen.add(frame.stamp_ns, scan.view)
     assert frame is not None
     trees, drive = rows_of(frame.trees, frame.trees.confirmed), run.motion.drive
     T_world_map = Pose2(float(drive.x[0]), float(drive.y[0]), float(drive.yaw[0]))

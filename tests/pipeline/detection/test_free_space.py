@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.detection.free_space import BEHIND, BINS, DENSE, FIELD, clear_range
+from pipeline.detection.free_space import BEHIND, BINS, DENSE, FIELD, clear_range, seen_range
 from pipeline.geometry.azimuth_bins import direction_bin
 from tests.pipeline.strategies import seeds
 
@@ -128,3 +128,55 @@ def test_the_free_distance_is_that_of_the_nearest_point_by_direction(seed, sprea
     free = np.where(near, nearest, 0.0)
     wanted = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
     np.testing.assert_allclose(clear_range(raw, raw, sensor), wanted)
+
+
+HEIGHT, BAND = 1.0, (0.3, 3.0)  # of the sensor above plane ground, and where stems are looked for [m]
+
+
+def seen_of(points, offset=(0.0, 0.0, HEIGHT), band=BAND, free=None):
+    """`seen_range` of returns above plane ground at z = -HEIGHT, without free range by default."""
+    points = np.asarray(points, np.float32).reshape(-1, 3)
+    free = np.zeros(BINS) if free is None else free
+    return seen_range(points, points[:, 2] + np.float32(HEIGHT), np.array(offset), HEIGHT, band, free)
+
+
+@pytest.mark.parametrize(
+    ("end", "seen"),
+    [
+        ((8.0, 0.0, 0.2), 8.0),  # a stem
+        ((10.0, 0.0, -1.0), 7.0),  # the ground: the ray is below 0.3 m from 7 m on
+        ((10.0, 0.0, 4.0), 5.0),  # a crown, 5 m above the ground: the ray is above 3 m from 5 m on
+    ],
+)
+def test_a_ray_shows_stems_as_far_as_it_is_in_the_band(end, seen):
+    ranges = seen_of([end, (2.0, 0.0, -0.5)])  # undergrowth of half a metre hides nothing above it
+    ahead = direction_bin(1.0, 0.0, BINS)
+    assert ranges[ahead] == pytest.approx(seen, abs=1e-5)
+    assert not np.delete(ranges, ahead).any()
+
+
+@pytest.mark.parametrize("end", [(10.0, 0.0, 4.0), (10.0, 0.0, -1.0)])
+def test_a_sensor_outside_of_the_band_sees_stems_only_along_rays_that_enter_it(end):
+    above, below = seen_of([end], band=(0.3, 0.9)).max(), seen_of([end], band=(1.1, 3.0)).max()
+    enters = (above, below) if end[2] < 0.0 else (below, above)
+    assert enters[0] > 0.0
+    assert enters[1] == 0.0
+
+
+@given(seeds)
+def test_the_seen_range_is_that_of_points_along_all_rays(seed):
+    rng = np.random.default_rng(seed)
+    ends = rng.uniform((-15.0, -15.0, -1.0), (15.0, 15.0, 5.0), (40, 3))
+    offset, free = np.array([*rng.uniform(-1.0, 1.0, 2), HEIGHT]), rng.choice([0.0, 4.0, np.inf], BINS)
+    got = seen_of(ends, offset, free=free)
+    wanted = free.copy()
+    part = np.linspace(0.0, 1.0, 2001)[:, None]
+    for end in ends:
+        ray = part * end
+        last = np.flatnonzero((ray[:, 2] + HEIGHT >= BAND[0]) & (ray[:, 2] + HEIGHT <= BAND[1]))[-1]
+        x, y = ray[last, :2] + offset[:2]
+        k = direction_bin(x, y, BINS)
+        wanted[k] = max(wanted[k], np.hypot(x, y))
+    apart = np.flatnonzero(~np.isclose(got, wanted, atol=0.02))
+    assert len(apart) <= 2, "only a ray at the border of two directions"
+    assert (got >= free).all()

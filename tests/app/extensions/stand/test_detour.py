@@ -19,7 +19,8 @@ def area(half: float) -> SeenArea:
     """An observed square around the origin."""
     side = np.arange(-round(half / CELL), round(half / CELL))
     place = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    return SeenArea(CELL, place, np.ones(len(place)), np.ones(len(place), np.int64))
+    n = len(place)
+    return SeenArea(CELL, place, np.ones(n), np.ones(n, np.int64), np.ones(n, np.bool_))
 
 
 def seen_from(bearing: float) -> int:

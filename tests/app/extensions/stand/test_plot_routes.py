@@ -42,7 +42,7 @@ async def look(dashboard: Dashboard) -> None:
     """Views from all three scans of the path, 10 m far."""
     assert dashboard.path is not None
     for stamp in dashboard.path.stamp_ns.tolist():
-        await dashboard.receive(View(1, stamp, np.full(BINS, 10.0)))
+        await dashboard.receive(View(1, stamp, np.full((2, BINS), 10.0)))
 
 
 async def test_a_rejected_tree_is_marked_in_the_table_and_counts_in_no_figure(both) -> None:

@@ -40,7 +40,8 @@ def path_of(poses):
 def area_of(cells):
     """An area that was observed from 1 m, twice."""
     place = np.array(cells, np.int64).reshape(-1, 2)
-    return SeenArea(CELL, place, np.ones(len(place)), np.full(len(place), 2))
+    n = len(place)
+    return SeenArea(CELL, place, np.ones(n), np.full(n, 2), np.ones(n, np.bool_))
 
 
 @given(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(0.1, 500))
@@ -110,19 +111,20 @@ def test_a_scan_observes_up_to_its_free_range_and_not_behind_a_stem():
     free = np.full(BINS, 10.0)
     free[: BINS // 4] = 3.0  # a quarter of all directions is hidden
     recorder = SeenRecorder()
-    recorder.add(0, free)
+    recorder.add(0, np.stack([np.full(BINS, 6.0), free]))
     seen = recorder.area(path_of([[0, 0, 0]]))
     expected = math.pi * (0.75 * 10.5**2 + 0.25 * 3.5**2)
     assert len(seen.place) * CELL**2 == pytest.approx(expected, rel=0.02)
     np.testing.assert_allclose(seen.nearest, np.hypot(*seen.centres.T))
     assert (seen.views == 1).all()
+    np.testing.assert_array_equal(seen.clear, seen.nearest <= 6.5)
 
 
 def test_the_observed_area_moves_with_the_final_path():
-    recorder, free = SeenRecorder(), np.full(BINS, 4.0)
-    recorder.add(0, free)
-    recorder.add(2 * 10**9, free)
-    recorder.add(9 * 10**9, free)  # later than the path, as after a seek back
+    recorder, view = SeenRecorder(), np.full((2, BINS), 4.0)
+    recorder.add(0, view)
+    recorder.add(2 * 10**9, view)
+    recorder.add(9 * 10**9, view)  # later than the path, as after a seek back
     seen = recorder.area(path_of([[100, 50, 1], [0, 0, 0], [101, 50, 1]]))
     np.testing.assert_allclose(seen.centres.mean(axis=0), [100.5, 50.0], atol=0.3)
     assert seen.views.max() == 2
@@ -135,13 +137,15 @@ def test_the_observed_area_does_not_depend_on_how_many_views_are_grouped_at_once
     rng = np.random.default_rng(3)
     recorder, poses = SeenRecorder(), rng.uniform(-20.0, 20.0, (12, 3))
     for k in range(len(poses)):
-        recorder.add(k * 10**9, rng.uniform(1.0, 12.0, BINS))
+        recorder.add(k * 10**9, rng.uniform(1.0, 12.0, (2, BINS)))
     at_once = recorder.area(path_of(poses))
     monkeypatch.setattr("pipeline.seen_area.ROWS_MOST", 1000)
     in_parts = recorder.area(path_of(poses))
     np.testing.assert_array_equal(in_parts.place, at_once.place)
     np.testing.assert_array_equal(in_parts.nearest, at_once.nearest)
     np.testing.assert_array_equal(in_parts.views, at_once.views)
+    np.testing.assert_array_equal(in_parts.clear, at_once.clear)
+    assert 0 < np.count_nonzero(at_once.clear) < len(at_once.clear)
     assert at_once.views.max() > 2
 
 
@@ -176,6 +180,7 @@ def test_reach_and_views_limit_what_counts_as_observed():
         np.array([[0, 0], [1, 0], [2, 0], [3, 0]]),
         np.array([1.0, 16, 1, np.nan]),
         np.array([2, 9, 1, 0]),
+        np.ones(4, np.bool_),
     )
     assert within_reach(seen, Stand()).place[:, 0].tolist() == [0, 3]
 
@@ -239,7 +244,9 @@ def test_cells_that_stems_and_their_undergrowth_hide_are_observed():
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(20), np.arange(20)))
     hidden = ((x == 5) & (y == 5)) | ((x > 9) & (x < 12) & (y > 9) & (y < 12)) | ((x > 13) & (y > 13))
     place = np.stack([x, y], axis=1)[~hidden]
-    seen = SeenArea(0.5, place, np.where(place[:, 0] < 8, 3.0, 9.0), np.full(len(place), 4))
+    n = len(place)
+    near = np.where(place[:, 0] < 8, 3.0, 9.0)
+    seen = SeenArea(0.5, place, near, np.full(n, 4), np.ones(n, np.bool_))
     kept = within_reach(seen, Stand())
     assert len(kept.place) == 400 - 35, "holes up to 1 m are closed, the corner is not but for its tip"
     row = kept.rows(np.array([[2.75, 2.75], [5.25, 5.25], [8.0, 8.0]]))

@@ -100,7 +100,7 @@ async def test_the_report_of_a_run_is_that_of_the_command_line(both: Running, tm
     await play(dashboard)
     assert dashboard.path is not None
     for stamp in dashboard.path.stamp_ns.tolist():
-        await dashboard.receive(View(1, stamp, np.full(360, 8.0)))
+        await dashboard.receive(View(1, stamp, np.full((2, 360), 8.0)))
     await show(dashboard, 3, 4)
     shape = {"kind": "circle", "x": 1.0, "y": 1.0, "radius": 3.0}
     run = (await client.get("/api/annotations")).json()["run"]
