@@ -16,6 +16,7 @@ PERIOD_MAX_S = 0.5  # s; a longer time between two scans is a pause, in which no
 #: First words of the messages. A run that gives one of them ends with exit code 3.
 DOUBTFUL = "the map is doubtful"
 EMPTY = "no return is within the range limits; are the points in metres?"
+GROUNDLESS = "most scans show no ground (is the LiDAR mounted as stated?)"
 _EFFECTS = {
     "lost": "trees from there on may be displaced, missing or mapped twice",
     "odometry": "from there on only the trees in view lead the robot: trees may be displaced or mapped twice",
@@ -106,6 +107,22 @@ def _updated(before: Fault, kind: str, reason: str, stamp_ns: int, start_ns: int
     return Fault(share, since_ns, message)
 
 
+def fault_of_short_run(scans: int, groundless: int, *, is_empty: bool) -> str:
+    """Return a message if most scans of a run do not show the ground; "" otherwise. A run that is shorter
+    than a fault that lasts has no other message about it.
+
+    Args:
+        scans, groundless: Number of scans, and of those that do not show the ground.
+        is_empty: Whether there are returns, and none within the range limits.
+    """
+    if is_empty or groundless > FAILED * scans:
+        reason = EMPTY if is_empty else GROUNDLESS
+        return (
+            f"{DOUBTFUL} in the whole run: {reason}; its trees, heights and diameters may be missing or wrong"
+        )
+    return ""
+
+
 def reasons_of(health: Health, *, is_ground_missing: bool, is_empty: bool) -> dict[str, str]:
     """Return a dict from the kinds of faults of a scan to their reasons.
 
@@ -122,5 +139,5 @@ def reasons_of(health: Health, *, is_ground_missing: bool, is_empty: bool) -> di
     if health.state == "weak" and not health.doubt and not health.reason.startswith(_UNCONTRADICTED):
         found["trees"] = health.reason
     if is_ground_missing or is_empty:
-        found["ground"] = EMPTY if is_empty else "most scans show no ground (is the LiDAR mounted as stated?)"
+        found["ground"] = EMPTY if is_empty else GROUNDLESS
     return found

@@ -38,13 +38,14 @@ from app.store.forests import mapper_of
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import MapScores, PathError, path_error
+from pipeline.ground.scan_ground import NO_GROUND
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers.base import Source
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.result_files import ODOMETRY, RunFiles, seen_text, terrain_text, tum_text
 from pipeline.jit import on_compiling
 from pipeline.loop_closure.correction import DOUBLED, NOT_FOUND
-from pipeline.map_faults import DOUBTFUL, EMPTY
+from pipeline.map_faults import DOUBTFUL, fault_of_short_run
 from pipeline.mapper import Mapper
 from pipeline.odometry.lidar_odometry import LOST
 from pipeline.odometry.odometry_override import OdometryOverride
@@ -189,9 +190,10 @@ def _map(
         tally.warned[unconfirmed] += 1
     if left_out_words := left_out_warning(losses, frame.index + 1):
         tally.warned[left_out_words] += 1
-    returns = tally.points["returns"]
-    if returns and tally.points["out of range"] == returns and not any(DOUBTFUL in w for w in tally.warned):
-        tally.warned[f"{DOUBTFUL} in the whole run: {EMPTY}"] += 1  # too short for a fault that lasts
+    if not any(DOUBTFUL in text for text in tally.warned):
+        is_empty = 0 < tally.points["returns"] == tally.points["out of range"]
+        if fault := fault_of_short_run(frame.index + 1, tally.warned[NO_GROUND], is_empty=is_empty):
+            tally.warned[fault] += 1
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words

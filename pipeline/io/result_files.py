@@ -200,7 +200,7 @@ def geojson(
             become the geometry, and x and y become properties.
     """
     features = tree_features(trees, start_ns, lon_lat=lon_lat)
-    return features_text(features, None if lon_lat is not None else ROBOTS_FRAME if frame is None else frame)
+    return features_text(features, (frame or ROBOTS_FRAME) if lon_lat is None else None)
 
 
 def tree_features(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.map_faults import DOUBTFUL, EMPTY, MapFaults, reasons_of
+from pipeline.map_faults import DOUBTFUL, EMPTY, GROUNDLESS, MapFaults, fault_of_short_run, reasons_of
 from pipeline.slam.pose_quality import RunningStatistics, ScanStatistics, pose_health
 from pipeline.types.records import Health
 
@@ -94,3 +94,11 @@ def test_a_weak_pose_that_nothing_contradicts_makes_no_map_doubtful(recent, cova
 def test_a_lost_position_makes_a_map_doubtful():
     health = pose_health(RunningStatistics(), ScanStatistics(), 50.0, 50, np.diag([2.0**2, 2.0**2, 1e-6]))
     assert "lost" in reasons_of(health, is_ground_missing=False, is_empty=False)
+
+
+@pytest.mark.parametrize(
+    ("groundless", "is_empty", "reason"), [(3, False, GROUNDLESS), (4, True, EMPTY), (2, False, "")]
+)
+def test_a_run_that_is_shorter_than_a_lasting_fault_is_judged_by_its_scans(groundless, is_empty, reason):
+    told = fault_of_short_run(4, groundless, is_empty=is_empty)
+    assert told.startswith(f"{DOUBTFUL} in the whole run: {reason}") if reason else told == ""

@@ -363,6 +363,15 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("reach", ["2.5", "2.9"])
+def test_a_short_run_without_ground_is_not_called_good(tmp_path, capsys, reach):
+    """A second is too short for a fault that lasts. Within 2.5 m there is no return, within 2.9 m too few."""
+    limits = ("--set", f"acquisition.range_max={reach}")
+    told = stemmap(capsys, "map", "sim:stand?duration=1", *limits, "--out", tmp_path)
+    assert told.code == 3
+    assert "the map is doubtful in the whole run" in told.err + told.out
+
+
 def test_mapping_twice_gives_the_same_bytes(mapped, tmp_path, capsys):
     told = stemmap(capsys, "map", "sim:paper?duration=4", "--out", tmp_path)
     assert told.code == 0

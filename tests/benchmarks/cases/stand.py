@@ -21,17 +21,19 @@ RADIUS = 15.0
 STAND = "sim:stand?seed={seed}&duration=40"
 DENSE = "sim:dense?seed={seed}&duration=30"
 SHORT = "sim:dense?seed={seed}&duration=10"
+WILD = "sim:wild?seed={seed}&duration=25"
 KEYS = ("n_ha", "g_ha")
 VARIANTS = ("_plain", "", "_corrected")
 NAMES = {"_plain": "whole plot", "": "observed area", "_corrected": "observed area, detection corrected"}
 
 
 def run() -> list[Table]:
-    """The stand with its standard errors, then the dense stand with and without corrections."""
+    """The stand with its standard errors, the dense stand with and without corrections, and undergrowth."""
     return [
         _table("sim:stand, 40 s of drive", STAND, errors_asked=True),
         _table("sim:dense, one pass of 30 s", DENSE, errors_asked=False),
         _table("sim:dense, one pass of 10 s", SHORT, errors_asked=False),
+        _table("sim:wild, 25 s of drive", WILD, errors_asked=False),
     ]
 
 

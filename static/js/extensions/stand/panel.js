@@ -202,7 +202,7 @@ function hint() {
   return `Trees of the map at the shown time.${trees} ± is the standard error; trees that neither the map nor people have are not included. For the mean it is the variation between plots, at least the error of the plots.`;
 }
 
-const UNKNOWN_ERROR = " The error of the stems is not known where all of the area was observed and no diameter is near the minimum: it is that of the trees that the map lacks.";
+const UNKNOWN_ERROR = " The error of the stems is not known where all of the area was observed and no diameter is near the minimum: only trees that were not found could change the number.";
 const NO_DECREASE = { "": "Detection does not decrease with distance within reach: the figures are not corrected.",
   correction: "Detection is not estimated: every tree in view counts as found.",
   whole_cloud: "Detection is not estimated for a whole cloud: every tree counts as found.",
