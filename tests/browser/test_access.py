@@ -79,6 +79,9 @@ def test_controls_are_large_for_gloves_and_the_page_is_readable_in_the_sun(dashb
         assert page.evaluate("document.documentElement.scrollWidth") <= 820
         assert page.evaluate(OUTSIDE) == [], tab
         assert too_low(page, 7.0, 4.5) == [], tab
+    for width in (360, 390, 440):
+        page.set_viewport_size({"width": width, "height": 740})
+        assert page.evaluate(COVERED) == [], width
     page.reload()
     expect(page.locator("html")).to_have_attribute("data-controls", "large")
     expect(page.locator("html")).to_have_attribute("data-contrast", "high")
@@ -96,6 +99,15 @@ OUTSIDE = """() => {
     && !node.closest('.scroll, [class$=-list]'); // these scroll
   const all = [...document.querySelectorAll('#side :is(button, select, input)')];
   return all.filter(isCut).map(node => node.id || node.textContent);
+}"""
+
+# Controls of the playback that another one covers in part.
+COVERED = """() => {
+  const all = [...document.querySelectorAll('.transport :is(button:not(.mark), select)')];
+  const boxes = all.filter(node => node.offsetWidth).map(node => [node.id, node.getBoundingClientRect()]);
+  return boxes.flatMap(([id, a], k) => boxes.slice(k + 1)
+    .filter(([, b]) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom)
+    .map(([other]) => `${id} ${other}`));
 }"""
 
 # Controls lower than a finger in a glove needs; the marks of the timeline are as narrow as time is.

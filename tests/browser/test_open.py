@@ -115,6 +115,25 @@ def test_the_dialog_keeps_its_size_while_it_is_open(dialog: Page) -> None:
     assert dialog.locator("#source-dialog").bounding_box() == box
 
 
+def test_a_dialog_that_was_left_begins_with_the_whole_list_and_records_again(dialog: Page) -> None:
+    field, record = dialog.locator("#source-uri"), dialog.locator("#source-record")
+    listed = dialog.locator("#source-list button:visible")
+    expect(listed.first).to_be_visible()
+    shown = listed.count()
+    dialog.locator("#source-robot summary").click()
+    expect(field).to_have_value("zenoh:tcp/127.0.0.1:7447")
+    expect(listed).to_have_count(shown)  # an address is no filter
+    record.uncheck()
+    dialog.keyboard.press("Escape")
+    expect(dialog.locator("#source-dialog")).to_be_hidden()
+    dialog.locator("#source-button").click()
+    expect(field).to_have_value("")
+    expect(listed).to_have_count(shown)
+    dialog.locator("#source-robot summary").click()
+    expect(record).to_be_checked()
+    dialog.locator("#source-robot summary").click()
+
+
 def test_a_sensor_is_opened_by_the_form_and_its_run_is_recorded(page: Page, folder: Path) -> None:
     page.locator("#source-button").click()
     page.locator("#source-robot summary").click()

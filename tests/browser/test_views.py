@@ -62,3 +62,29 @@ def test_the_whole_map_is_shown_and_home_returns_to_the_first_view(dashboard: Da
 
 CHOOSE = """([name, value]) => fetch('/api/view', { method: 'PATCH', body: JSON.stringify({ name, value }),
   headers: { 'Content-Type': 'application/json' } })"""
+
+
+# Pixels per metre of the map.
+SCALE = """async () => {
+  const { screenOf } = await import('/static/js/map/map.js');
+  return screenOf(1, 0)[0] - screenOf(0, 0)[0];
+}"""
+OTHER_SOURCE = """async (source) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const before = state.status.source;
+  state.status = { ...state.status, source: source ?? before };
+  changed('status');
+  return before;
+}"""
+
+
+def test_the_part_of_the_map_that_a_person_chose_is_left_with_the_run(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#map-fit").click()
+    whole = page.evaluate(SCALE)
+    page.locator("#map").hover()
+    page.mouse.wheel(0, -600)
+    dashboard.until(f"async () => await ({SCALE})() > {1.5 * whole}")
+    source = page.evaluate(OTHER_SOURCE, "sim:other")
+    assert page.evaluate(SCALE) == pytest.approx(whole)
+    page.evaluate(OTHER_SOURCE, source)

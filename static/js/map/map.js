@@ -147,7 +147,17 @@ function showNextToReview() {
   map.bringIntoView(x, y);
 }
 
+let mapped = ""; // source of the map that is shown
+
+// The part that a person chose was one of the run before.
+function fitToRun({ status }) {
+  const before = mapped;
+  mapped = status?.source ?? before;
+  if (before && mapped !== before) map.fit();
+}
+
 export function startMap() {
+  on("status", fitToRun);
   byId("map-png").addEventListener("click", () => saveCanvas("map.png", canvas));
   byId("map-csv").addEventListener("click", () => saveCsv("map.csv", tableOfMap()));
   byId("map-fit").addEventListener("click", () => map.fit());

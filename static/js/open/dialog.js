@@ -94,16 +94,23 @@ function finish(message) {
   requested = asked = null;
   setText(byId("source-open"), "Open");
   showWait("");
-  if (message) return say(message);
+  if (message) say(message);
+  else dialog.close();
+}
+
+// The next visit begins with the whole list, however the dialog was closed.
+function clear() {
+  if (requested !== null) finish("");
   byId("source-uri").value = "";
   byId("source-robot").open = false;
+  byId("source-record").checked = true; // what was not recorded is lost
   byId("source-uri").dispatchEvent(new Event("input"));
-  dialog.close();
+  forget();
 }
 
 function follow({ status }) {
   if (asked === null || status === left) return;
-  if (status.source === asked && status.detail) showWait(status.detail, progressOf(status));
+  if (status.detail && (status.source === asked || status.compiling_since_s !== null)) showWait(status.detail, progressOf(status));
   if (status.state === "failed") finish(status.detail || `${asked} could not be opened.`);
   else if (status.source === asked && status.state !== "starting") finish(""); // a whole cloud takes minutes until its first map
 }
@@ -152,7 +159,7 @@ export function startSources() {
     chosenAt = path();
     show();
   });
-  dialog.addEventListener("close", forget);
+  dialog.addEventListener("close", clear);
   startInside();
   startRobotForm();
   on("status", follow);

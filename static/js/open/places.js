@@ -5,6 +5,7 @@ import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { count } from "../core/format.js";
 import { shortSource, when } from "../runs/figures.js";
+import { isLive } from "./robot_form.js";
 
 const MOST_RECENT = 6, MOST_NEAR = 3;
 const ALIKE = 0.5; // least likeness of a near miss, 0 to 1
@@ -59,10 +60,11 @@ function withOptions(uri) {
   return typed.length ? `${uri}?${new URLSearchParams(typed)}` : uri;
 }
 
-// Shows what has all typed words, with its folders open; everything where nothing is typed. That nothing has them says nothing of an
-// address that is being opened.
+// Shows what has all typed words, with its folders open; everything where nothing is typed, or the address of a robot. That nothing has
+// them says nothing of an address that is being opened.
 export function sift(isOpening = false) {
-  const words = byId("source-uri").value.trim().toLowerCase().split(/\s+/).filter(Boolean);
+  const typed = byId("source-uri").value.trim();
+  const words = isLive(typed) ? [] : typed.toLowerCase().split(/\s+/).filter(Boolean);
   for (const { node, words: own } of entries) node.hidden = !words.every((word) => own.includes(word));
   for (const each of byId("source-list").querySelectorAll("details")) {
     const found = [...each.querySelectorAll(":scope button")].some((node) => !node.hidden);

@@ -75,9 +75,7 @@ export function startRobotForm() {
     write();
   });
   build();
-  const record = byId("source-record");
-  record.checked = recall("record") !== "no"; // what was not recorded is lost
-  record.addEventListener("change", () => remember("record", record.checked ? "yes" : "no"));
+  byId("source-record").checked = true;
   const show = () => { byId("source-recorded").hidden = !isLive(uri()); };
   byId("source-uri").addEventListener("input", show);
   byId("source-robot").addEventListener("toggle", ({ target }) => {
