@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.batch.run_edits import SAME_THING
+from app.batch.run_edits import SAME_THING, TAPE_SIGMA
 from app.store.async_store import AsyncStore
 from app.store.records import (
     FRAME,
@@ -36,6 +36,11 @@ from pipeline.types.records import Trees, TruthTrees
 
 if TYPE_CHECKING:
     from app.store.store import Store
+
+# Largest distance between an annotation and its row in an exported table [m], which has 0.1 mm.
+_SAME_PLACE = 0.001
+# Two diameters are the same below this difference [m]: an exported table has 0.1 mm.
+_SAME_DBH = 0.0001
 
 Against = Literal["both", "own", "annotations"]
 Counted = Literal["none", "source", "annotations", "both"]
@@ -344,10 +349,10 @@ class AnnotationEditor:
 
         The keys are `run`, `serial`, `problem` and `against`, the attributes; `used`, the result of
         `counted`; `own`, the number of objects in the ground truth of the source, None if there is none;
-        `contradicting`, the result of this function; `same_thing_m`, SAME_THING; `trees` and `skipped`, lists
-        of `row_payload`; `others`, a dict from the class of each of `others` to a list of `values_payload`;
-        `repairs`, the `identity_of` the repairs; and `frame`, the `values_payload` of `frame`, None for a
-        local map.
+        `contradicting`, the result of this function; `same_thing_m`, SAME_THING;
+        `tape_sigma_cm`, TAPE_SIGMA in cm; `trees` and `skipped`, lists of `row_payload`; `others`, a dict
+        from the class of each of `others` to a list of `values_payload`; `repairs`, the `identity_of` the
+        repairs; and `frame`, the `values_payload` of `frame`, None for a local map.
         """
         return {
             "run": self.run,
@@ -358,6 +363,7 @@ class AnnotationEditor:
             "own": None if self._own is None else len(self._own.x),
             "contradicting": contradicting(self._own, self.rows),
             "same_thing_m": SAME_THING,
+            "tape_sigma_cm": 100.0 * TAPE_SIGMA,
             "trees": [row_payload(row) for row in self.rows],
             "skipped": [row_payload(row) for row in self.skipped],
             "others": {
@@ -367,6 +373,61 @@ class AnnotationEditor:
             "repairs": identity_of(self.repairs),
             "frame": None if self.frame is None else values_payload(self.frame),
         }
+
+
+@dataclass(frozen=True, slots=True)
+class ImportPlan:
+    """What an import of a table does.
+
+    Attributes:
+        added: Contents of new annotations.
+        filled: Id, version and new content of each annotation that gets a DBH.
+        conflicts: The annotation and the row that contradicts it, of each row that is left out for that.
+        repeated: Number of rows that say nothing new.
+    """
+
+    added: list[Content]
+    filled: list[tuple[int, int, Content | None]]
+    conflicts: list[tuple[Content, Content]]
+    repeated: int
+
+
+def import_plan(rows: Sequence[Annotation], contents: Sequence[Content]) -> ImportPlan:
+    """Return what an import of a table does.
+
+    A row at the place of an annotation, or of an earlier row, adds no second annotation there. It gives its
+    DBH to one of the same class without DBH. With another class or another DBH it is a conflict, and nothing
+    is stored.
+
+    Args:
+        rows: The annotations of objects.
+        contents: The rows of the table in the frame of the map.
+    """
+    from scipy.spatial import cKDTree
+
+    known = [*(row.content for row in rows), *contents]
+    at = cKDTree(np.array([(each.x, each.y) for each in known]).reshape(-1, 2))
+    stored, filled = set(range(len(rows))), set[int]()
+    conflicts = list[tuple[Content, Content]]()
+    for k, content in enumerate(contents, start=len(rows)):
+        near = stored.intersection(at.query_ball_point((content.x, content.y), _SAME_PLACE))
+        if not near:
+            stored.add(k)
+            continue
+        j = min(near, key=lambda j: (known[j].kind != content.kind, j))
+        here = known[j]
+        if here.kind != content.kind:
+            conflicts.append((here, content))
+        elif here.dbh is None and content.dbh is not None:
+            known[j] = replace(here, dbh=content.dbh)
+            filled.add(j)
+        elif here.dbh is not None and content.dbh is not None and abs(here.dbh - content.dbh) > _SAME_DBH:
+            conflicts.append((here, content))
+    added = [known[j] for j in sorted(stored) if j >= len(rows)]
+    changed = list[tuple[int, int, Content | None]]()
+    changed += [(row.id, row.version, known[j]) for j, row in enumerate(rows) if j in filled]
+    repeated = len(contents) - len(added) - len(changed) - len(conflicts)
+    return ImportPlan(added, changed, conflicts, repeated)
 
 
 def carried_by(

@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 
 from app.batch.map_frame import MapFrame, read_map_frame
+from app.batch.run_edits import TAPE_SIGMA
 from app.batch.run_folder import ByPeople, FinishedRun, read_by_people, read_run, read_seen_area
 from app.common.text import count, version
 from app.extensions.stand.figures import (
@@ -42,9 +43,6 @@ from pipeline.seen_area import SeenArea
 from pipeline.types.records import Trees
 
 ALL = "all"
-#: Standard deviation of a diameter that a person measured [m]: 0.3 cm between four people on 319 trees, there
-#: with calipers (Luoma et al. 2017, Forests 8(2), 38).
-TAPE_SIGMA = 0.003
 
 
 class PeopleCount(NamedTuple):

@@ -13,7 +13,7 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
-from app.dashboard.annotations import Against, carried_back, row_payload
+from app.dashboard.annotations import Against, carried_back, import_plan, row_payload
 from app.dashboard.dashboard import Dashboard
 from app.store.records import MOST_ANNOTATIONS, REPAIR, Author, Content, contents_of, moment
 from app.store.store import Store
@@ -25,6 +25,7 @@ from pipeline.repairs.record import Repair, numbers_at
 router = APIRouter(prefix="/api")
 
 _LARGEST_DBH_M = 10.0
+_MOST_NAMED = 3  # contradictions of an import that are named
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
 
 
@@ -131,21 +132,26 @@ async def redo(body: _Turn, dashboard: Dash) -> Response:
 
 @router.post("/annotations/import")
 async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
-    """Add the rows of a CSV table in one edit. Return the number of added rows (`added`), the number of rows
-    that exist already as annotations or earlier in the table (`left_out`), and the counts of edits, see
-    `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows, 409 as in `add`; then
-    nothing is added. Without new rows there is no edit."""
+    """Add the rows of a CSV table, and the diameters that annotations lack, in one edit, see `import_plan`.
+    Return the number of added annotations (`added`), of diameters added to others (`filled`), of rows that
+    exist already as annotations or earlier in the table (`left_out`), and of rows that are left out because
+    they contradict an annotation (`differing`), with the first of these as text (`differences`); and the
+    counts of edits, see `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows,
+    409 as in `add`; then nothing is added. Without new rows and diameters there is no edit."""
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
     contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
-    existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
-    new: dict[tuple[float, float, str], Content] = {}
-    for content in contents:
-        if _key(content) not in existing:
-            new.setdefault(_key(content), content)
-    if new:
-        await apply_edit(dashboard, body, Store.add, list(new.values()))
-    return await edited(dashboard, body, {"added": len(new), "left_out": len(contents) - len(new)})
+    plan = import_plan(dashboard.annotation_editor.rows, contents)
+    if plan.added or plan.filled:
+        await apply_edit(dashboard, body, Store.edit, plan.added, plan.filled)
+    payload = {
+        "added": len(plan.added),
+        "filled": len(plan.filled),
+        "left_out": plan.repeated,
+        "differing": len(plan.conflicts),
+        "differences": [_difference(dashboard, *pair) for pair in plan.conflicts[:_MOST_NAMED]],
+    }
+    return await edited(dashboard, body, payload)
 
 
 @router.put("/annotations/against")
@@ -204,6 +210,17 @@ def _tree_at(dashboard: Dashboard, x: float, y: float) -> int | None:
     return next(iter(numbers_at(dashboard.shown.frame.trees, [(x, y)], confirmed=True)), None)
 
 
+def _difference(dashboard: Dashboard, here: Content, there: Content) -> str:
+    """Return how a row of a table (`there`) contradicts the annotation at its place."""
+    number = _tree_at(dashboard, here.x, here.y)
+    x, y = dashboard.offset
+    name = f"the annotation at {here.x + x:.2f}, {here.y + y:.2f}" if number is None else f"tree {number}"
+    if here.kind != there.kind:
+        return f"{name} is {here.kind} here, {there.kind} in the file"
+    mine, other = (f"{100.0 * (dbh or 0.0):.2f}".rstrip("0").rstrip(".") for dbh in (here.dbh, there.dbh))
+    return f"{name} has DBH {mine} cm here, {other} cm in the file"
+
+
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
     """Return an annotation, see `_rows`, as a GeoJSON feature (dict): a point at x, y with the `id` of the
     annotation and the properties `class`, `dbh_cm`, `who`, `edited` (time as text) and `tree`."""
@@ -225,11 +242,6 @@ def _row(row: dict[str, Any]) -> list[str]:
 def _when(row: dict[str, Any]) -> str:
     """Return the time of the last edit of an annotation, see `_rows`, as text."""
     return moment(round(row["at_s"] * 1e9))
-
-
-def _key(content: Content) -> tuple[float, float, str]:
-    """Return the key of a row; rows with the same key (kind, and position to the millimetre) are the same."""
-    return round(content.x, 3), round(content.y, 3), content.kind
 
 
 def _check(content: Content, row: int) -> None:

@@ -97,9 +97,15 @@ async function take(file, unit) {
   const confirmed = () => trees().filter((tree) => reviewOf(tree) === "confirmed").length, before = confirmed();
   const done = await importTable(await file.text(), unit);
   const more = confirmed() - before;
-  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
+  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
   if (done) showNews(imported);
   fill();
+}
+
+function differingText({ differing, differences }) {
+  if (!differing) return "";
+  const more = differing - differences.length;
+  return `; ${differing} ${differing === 1 ? "differs from its annotation and was" : "differ from their annotations and were"} left out: ${differences.join("; ")}${more ? `; and ${more} more` : ""}`;
 }
 
 function lineOf(row) {

@@ -223,6 +223,46 @@ async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
     assert await rows(client) == []
 
 
+async def test_a_row_that_contradicts_an_annotation_is_left_out_and_named(both: Running) -> None:
+    client, dashboard = both
+    assert dashboard.shown is not None
+    trees = dashboard.shown.frame.trees
+    k = int(np.flatnonzero(trees.confirmed)[0])
+    number, (x, y) = int(trees.number[k]), trees.position[k].tolist()
+    await edit(client, "POST", x=x, y=y, kind="tree")
+    await edit(client, "POST", x=50.0004, y=6.00045, kind="tree", dbh_cm=30.5)
+    before = await rows(client)
+    table = (await client.get("/api/annotations.csv")).text
+    kinds = (await edit(client, "POST", "/import", table=table.replace(",tree,", ",pole,"))).json()
+    assert (kinds["added"], kinds["filled"], kinds["left_out"], kinds["differing"]) == (0, 0, 0, 2)
+    assert kinds["differences"] == [
+        f"tree {number} is tree here, pole in the file",
+        "the annotation at 50.00, 6.00 is tree here, pole in the file",
+    ]
+    dbh = (await edit(client, "POST", "/import", table=table.replace("30.50", "31.5"))).json()
+    assert (dbh["added"], dbh["left_out"], dbh["differing"]) == (0, 1, 1)
+    assert dbh["differences"] == ["the annotation at 50.00, 6.00 has DBH 30.5 cm here, 31.5 cm in the file"]
+    assert await rows(client) == before
+    assert dbh["undo"] == {"tree": 2}
+    # Rows of one table that contradict each other; a few are named.
+    many = "x_m,y_m,class\n" + "".join(f"{90 + n},0,tree\n{90 + n},0,pole\n" for n in range(5))
+    within = (await edit(client, "POST", "/import", table=many)).json()
+    assert (within["added"], within["differing"], len(within["differences"])) == (5, 5, 3)
+
+
+async def test_an_imported_dbh_fills_the_annotation_and_is_undone_with_the_import(both: Running) -> None:
+    client, _ = both
+    await edit(client, "POST", x=1.0, y=2.0)
+    await edit(client, "POST", x=3.0, y=2.0, kind="pole")
+    table = "x_m,y_m,dbh_cm,class\n1,2,26.4,tree\n3,2,,pole\n7,8,31,tree\n"
+    answer = (await edit(client, "POST", "/import", table=table)).json()
+    assert (answer["added"], answer["filled"], answer["left_out"], answer["differing"]) == (1, 1, 1, 0)
+    assert [row["dbh_cm"] for row in await rows(client)] == [26.4, None, 31.0]
+    assert answer["undo"] == {"tree": 3}
+    await edit(client, "POST", "/undo")
+    assert [row["dbh_cm"] for row in await rows(client)] == [None, None]
+
+
 async def test_a_saved_table_names_the_trees_of_the_map() -> None:
     async with running() as (client, dashboard):
         client.headers.update(BEARER)

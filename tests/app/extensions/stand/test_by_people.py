@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.batch.run_edits import reviewed_run
+from app.batch.run_edits import TAPE_SIGMA, reviewed_run
 from app.batch.run_folder import ByPeople, read_run
 from app.dashboard.shown_run import ShownRun
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plots import rectangle
-from app.extensions.stand.run_figures import TAPE_SIGMA, counted_trees, stand_of, stand_record, stand_summary
+from app.extensions.stand.run_figures import counted_trees, stand_of, stand_record, stand_summary
 from app.store.records import Content
 from tests.app.batch.finished_runs import grid_run
 from tests.app.cli.test_commands import stemmap
