@@ -410,7 +410,8 @@ def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard)
     expect(title).to_have_text(f"Tree {third}")
     canvas.press("r")
     expect(title).to_have_text(f"Tree {second}")
-    expect(page.locator("#review-state")).to_have_text("rejected")
+    expect(page.locator("#review-state")).to_have_text("rejected: pole")
+    expect(page.locator("#annotate-kind")).to_have_value("pole")
     page.locator("#review-story").click()
     expect(page.locator("#panel-story [data-rejected=pole]")).to_contain_text("rejected this tree")
     person.tab("Annotate")
@@ -421,7 +422,12 @@ def test_last_answers_are_listed_and_previous_returns_to_them(person: Dashboard)
     expect(title).to_have_text(f"Tree {first}")
     canvas.press("Control+z")
     expect(history.get_by_role("button").nth(1)).to_have_text(f"{second} pole")
-    expect(page.locator("#problem")).to_contain_text(f"Undone: tree {second} (pole).")
+    expect(page.locator("#problem")).to_contain_text(f"Undone: the answer bush of tree {second}.")
+    canvas.press("Control+y")
+    expect(history.get_by_role("button").nth(1)).to_have_text(f"{second} bush")
+    expect(page.locator("#problem")).to_contain_text(f"Redone: the answer bush of tree {second}.")
+    canvas.press("Control+z")
+    expect(history.get_by_role("button").nth(1)).to_have_text(f"{second} pole")
     canvas.press("Control+z")  # the answer before, which makes its tree open again
     expect(history.get_by_role("button")).to_have_text(["Previous (R)", f"{second} pole", f"{first} tree"])
     assert person.errors == []
@@ -566,7 +572,11 @@ def test_the_class_of_a_rejected_tree_holds_for_that_tree_only(person: Dashboard
     assert [row["kind"] for row in rows(person)] == ["bush", "other"]
     kind.select_option("pole")
     page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({first['number']}))")
-    expect(kind).to_have_value("other")  # the pole was another tree
+    expect(kind).to_have_value("bush")  # what it is; the pole was another tree
+    expect(page.locator("#review-state")).to_have_text("rejected: bush")
+    person.answer("n")
+    expect(page.locator("#review-last")).to_contain_text(f"Tree {first['number']}: bush, as before")
+    assert [row["kind"] for row in rows(person)] == ["bush", "other"]
 
 
 def test_edits_that_wait_while_another_run_is_opened_are_not_made_in_it(person: Dashboard):
@@ -769,6 +779,110 @@ def test_a_dbh_is_an_answer_and_gives_the_keys_back_to_the_review(person: Dashbo
     expect(page.locator("#annotate-error")).to_be_hidden()
 
 
+def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys_back(person: Dashboard):
+    page, canvas = person.page, person.page.locator("#map")
+    page.set_viewport_size({"width": 1280, "height": 720})
+    trees = person.ask("/api/trees")["trees"]
+    first, second = [tree for tree in trees if tree["dbh_cm"] is not None][:2]
+    select = "number => import('/static/js/core/live_feed.js').then(({ select }) => select(number))"
+    field, last = page.locator("#review-dbh"), page.locator("#review-last")
+    page.evaluate(select, first["number"])
+    person.answer("d")
+    expect(field).to_be_focused()
+    expect(field).to_be_in_viewport()
+    field.fill("2.6")
+    field.press("Enter")
+    mapped = f"{first['dbh_cm']:.1f} ± {first['sigma_dbh_cm']:.1f}"
+    expect(last.locator("span")).to_have_text(
+        f"Tree {first['number']}: tree, 2.6 cm; the map has {mapped} cm. In cm?"
+    )
+    page.evaluate(select, second["number"])
+    person.answer("d")
+    field.fill(str(second["dbh_cm"]))
+    field.press("Enter")
+    expect(last.locator("span")).to_have_text(f"Tree {second['number']}: tree, {second['dbh_cm']:g} cm")
+
+    # The keys of the card act again after Escape.
+    page.evaluate(select, first["number"])
+    person.answer("d")
+    expect(field).to_be_focused()
+    page.evaluate("document.querySelector('#panel-annotate').scrollTop = 1e4")
+    field.press("Escape")
+    expect(page.locator("#review-title")).to_be_in_viewport()
+    person.card_shown()
+    page.keyboard.press("Shift+P")
+    person.until_server("/api/annotations", "it.trees.some(row => row.kind === 'pole')")
+    canvas.press("Control+z")
+    expect(page.locator("#problem")).to_contain_text(
+        f"Undone: the answer pole, 2.6 cm of tree {first['number']}."
+    )
+    canvas.press("Control+z")
+    canvas.press("Control+z")
+    person.until_server("/api/annotations", "it.trees.length === 0")
+
+
+def test_the_line_with_undo_belongs_to_the_last_edit_and_undo_says_what_it_did(person: Dashboard):
+    page, canvas = person.page, person.page.locator("#map")
+    last, news = page.locator("#review-last"), page.locator("#problem")
+    tree = doubted(person)[0]
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({tree['number']}))")
+    person.answer("y")
+    expect(last).to_contain_text(f"Tree {tree['number']}: tree")
+    page.evaluate("import('/static/js/annotate/annotations.js').then(it => it.addAt({ x: 4, y: 30 }))")
+    person.until_server("/api/annotations", "it.trees.length === 2")
+    expect(last).to_be_hidden()
+    canvas.press("ArrowRight")
+    person.until_server("/api/annotations", "Math.abs(it.trees[1].x - 4.01) < 1e-6")
+    row = page.locator("#annotations tbody tr").first
+    row.get_by_label(re.compile("Class")).select_option("bush")
+    person.until_server("/api/annotations", "it.trees[1].kind === 'bush'")
+    row.get_by_label(re.compile("Delete")).click()
+    person.until_server("/api/annotations", "it.trees.length === 1")
+    undone = ["the bush deleted", "class of the tree changed to bush", "the tree moved", "tree added"]
+    for text in [*undone, f"the answer tree of tree {tree['number']}"]:
+        canvas.press("Control+z")
+        expect(news).to_contain_text(f"Undone: {text}.")
+    canvas.press("Control+y")
+    expect(news).to_contain_text(f"Redone: the answer tree of tree {tree['number']}.")
+
+    # The arrows move the annotation of a tree, and its line goes.
+    row.click(position={"x": 5, "y": 5})
+    person.answer("Shift+P")
+    expect(last).to_contain_text(f"Tree {tree['number']}: pole")
+    row.click(position={"x": 5, "y": 5})
+    canvas.press("ArrowRight")
+    expect(last).to_be_hidden()
+    person.until_server("/api/annotations", "it.trees[0].version === 5")
+    canvas.press("Control+z")
+    expect(news).to_contain_text(f"Undone: tree {tree['number']} moved.")
+
+
+def test_the_map_names_the_source_of_class_and_dbh(person: Dashboard):
+    page, tip = person.page, person.page.locator("#map-tip")
+    assert person.ask("/api/annotations")["used"] == "source"
+    truth = page.evaluate("import('/static/js/core/store.js').then(({ state }) => state.truth)")
+    known = [each for each in truth if each["kind"] == "tree" and each["dbh_cm"] is not None]
+    alone = [
+        each
+        for each in known
+        if sum((each["x"] - o["x"]) ** 2 + (each["y"] - o["y"]) ** 2 < 4.0 for o in truth) == 1
+    ]
+    confirmed, measured, other = sorted(alone, key=lambda each: each["x"] ** 2 + each["y"] ** 2)[:3]
+    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table))"
+    table = f"{confirmed['x']},{confirmed['y']},\n{measured['x']},{measured['y'] + 0.1},2.6\n"
+    page.evaluate(imported, f"x_m,y_m,dbh_cm\n{table}")
+    person.until_server("/api/annotations", "it.trees.length === 2")
+    page.get_by_role("button", name="Fit").click()
+    person.drawn()
+    for place, text in (
+        (confirmed, f"Annotation: tree\nGround truth: DBH {confirmed['dbh_cm']:.1f} cm"),
+        (measured, "Annotation: tree, DBH 2.6 cm"),
+        (other, f"Ground truth: tree, DBH {other['dbh_cm']:.1f} cm"),
+    ):
+        page.locator("#map").hover(position=place_of(person, place["x"], place["y"]))
+        person.eventually(lambda text=text: tip.inner_text().endswith(text), tip.inner_text)
+
+
 def test_accumulated_points_lie_under_the_map_of_the_tab(person: Dashboard):
     page = person.page
     page.get_by_role("button", name="Fit").click()
@@ -931,6 +1045,13 @@ FIVE_TIMES_RIGHT = """canvas => {
 }"""
 
 
+FORGET_REFUSAL = """async () => {
+  const { draft, news } = await import('/static/js/annotate/annotations.js');
+  draft.refused = "";
+  news();
+}"""
+
+
 def test_picture_question_and_answers_are_in_view_together(person: Dashboard):
     page = person.page
     page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
@@ -955,6 +1076,13 @@ def test_picture_question_and_answers_are_in_view_together(person: Dashboard):
             assert box["x"] >= 0, (width, part, box)
             assert box["x"] + box["width"] <= width + 0.5, (width, part, box)
         assert page.locator("#review-title").inner_text() == title, width
+        # A line over the picture moves nothing.
+        places = [page.locator(part).first.bounding_box() for part in parts]
+        page.evaluate("import('/static/js/annotate/annotations.js').then(it => it.refusePlain())")
+        expect(page.locator("#review-refused")).to_be_visible()
+        assert [page.locator(part).first.bounding_box() for part in parts] == places
+        page.evaluate(FORGET_REFUSAL)
+        expect(page.locator("#review-refused")).to_be_hidden()
 
 
 def test_an_import_says_how_many_trees_of_the_map_it_confirms(person: Dashboard):
@@ -968,6 +1096,34 @@ def test_an_import_says_how_many_trees_of_the_map_it_confirms(person: Dashboard)
     expect(person.page.locator("#annotate-hint")).to_contain_text(said)
     expect(person.page.locator("#problem")).to_contain_text(said)
     expect(person.page.locator("#annotate-confirmed")).to_have_text("1 confirmed")
+
+
+def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_named(person: Dashboard):
+    page, hint = person.page, person.page.locator("#annotate-hint")
+    trees = person.ask("/api/trees")["trees"]
+    table = "x_m,y_m,class\n" + "".join(f"{tree['x']},{tree['y']},tree\n" for tree in trees)
+    file = {"name": "plot.csv", "mimeType": "text/csv", "buffer": table.encode()}
+    page.locator("#annotate-file").set_input_files(file)
+    expect(hint).to_contain_text(f"{len(trees)} trees imported from plot.csv")
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({trees[0]['number']}))")
+    expect(hint).to_contain_text(f"All {len(trees)} trees are reviewed.")
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Save CSV", exact=True).click()
+    assert download.value.suggested_filename == "sim_stand_truth.csv"
+    lines = download.value.path().read_text(encoding="utf-8").splitlines()
+    lines[1], lines[2] = lines[1].replace(",,tree,", ",31.5,tree,"), lines[2].replace(",tree,", ",pole,")
+    file["buffer"] = "\n".join(lines).encode()
+    page.locator("#annotate-file").set_input_files(file)
+    expect(hint).to_contain_text(
+        "0 trees imported from plot.csv; 1 diameter added; 1 differs from its annotation and was left out: "
+        f"tree {trees[1]['number']} is tree here, pole in the file; {len(trees) - 2} left out because"
+    )
+    assert len(rows(person)) == len(trees)
+    assert rows(person)[0]["dbh_cm"] == 31.5
+    page.locator("#annotate-undo").click()
+    expect(page.locator("#problem")).to_contain_text(f"Undone: DBH of tree {trees[0]['number']} set to 31.5")
+    page.locator("#annotate-undo").click()
+    expect(page.locator("#problem")).to_contain_text(f"Undone: {len(trees)} annotations added.")
 
 
 def test_the_map_names_the_filter_that_makes_it_pale_and_removes_it(person: Dashboard):

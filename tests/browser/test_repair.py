@@ -208,7 +208,7 @@ def test_undo_of_a_tab_takes_back_nothing_of_another_tab(person: Dashboard):
     person.tab("Annotate")
     page.locator("#annotate-undo").click()
     person.until_server("/api/annotations", "it.trees.length === 0")
-    expect(page.locator("#problem")).to_contain_text("Undone: 1 annotation.")
+    expect(page.locator("#problem")).to_contain_text("Undone: tree added.")
     expect(page.locator("#annotate-undo")).to_be_disabled()
     person.tab("Repair")
     page.locator("#repair-undo").click()
@@ -272,7 +272,7 @@ SYMBOLS = """async () => {
   }
   state.truth = [{ x: 7, y: 8, dbh_cm: null, kind: 'tree' }];
   state.annotations = { ...state.annotations, trees: [{ id: 1, x: 7, y: 8, kind: 'tree', dbh_cm: null }],
-    others: { repair } };
+    others: { repair }, used: 'annotations' };
   changed('truth');
   return letters;
 }"""

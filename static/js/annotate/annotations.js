@@ -2,7 +2,7 @@
 
 import { get, put, request } from "../core/api.js";
 import { byId, recall, remember } from "../core/dom.js";
-import { count, share } from "../core/format.js";
+import { count, dbhFigure, share } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { attempted, showNews } from "../core/problem.js";
@@ -17,6 +17,7 @@ export const KINDS = ["tree", "pole", "person", "bush", "other"];
 const SKIPPED = "skipped"; // class of an annotation that states nothing
 export const STATES = ["open", "confirmed", "rejected", "skipped"]; // of a found tree in the review
 const LARGEST_DBH = 1000; // [cm]
+const MOST_SIGMAS = 4; // of the difference between a diameter by tape and that of the map; a normal error is larger in 1 of 16,000 trees
 const MOST_ANSWERED = 20; // answers to which the review returns
 // [ms] for which a card must have been on the screen before it is answered: what takes less is no judgement of its picture. People
 // need about 150 ms to recognise the content of a picture (Thorpe, Fize and Marlot, Nature 381, 1996). A choice between two answers
@@ -37,10 +38,10 @@ export const draft = {
   held: null, // the annotation on which the pointer is pressed
   moves: false, // whether it was chosen before, so that dragging moves it
   moved: null, // {id, row, x, y} while an annotation is dragged or nudged
-  kind: "other", // class of a rejected tree
+  kind: null, // chosen class of a rejected tree, see `rejectedKind`
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
   shownAt: Infinity, // [ms] time since which it is on the screen
-  answer: null, // {number, kind} of the last answer of the review
+  answer: null, // see `answerOf`, if the last edit stated something about a tree
   answered: [], // ids of the annotations of the last answers, the newest last
   error: "",
   refused: "", // why the last answer did not count
@@ -87,10 +88,11 @@ export const send = (method, path, fields = {}) => request(path, { method, heade
 const call = (method, where, fields) => send(method, `/api/annotations${where}`, fields);
 
 // Edits are sent one at a time; each has come back before the next one is sent. An error stays until the person makes another
-// edit, and not only until the next one in the queue is stored. An edit belongs to the run that was open when it was made.
-export function edit(work) {
+// edit, and not only until the next one in the queue is stored. An edit belongs to the run that was open when it was made. `answer` is
+// what it says about a tree, null for other edits: the line with Undo belongs to the last edit.
+export function edit(work, answer = null) {
   const run = state.annotations?.run;
-  draft.error = "";
+  Object.assign(draft, { error: "", answer });
   last = last.then(async () => {
     try {
       if (run !== state.annotations?.run) throw new Error("Another run was opened meanwhile: this edit belongs to the one before and was not made.");
@@ -101,6 +103,7 @@ export function edit(work) {
       return done;
     } catch (error) {
       draft.error = error.message;
+      if (draft.answer === answer) draft.answer = null; // not that of a later edit
       return null;
     } finally {
       news();
@@ -151,7 +154,11 @@ function latest({ id, version }) {
   return now;
 }
 
-export const change = (row, fields) => edit(() => patched(row, fields));
+export function change(row, fields) {
+  const tree = treeOf(treeNumberOf(row)), { x, y, kind, dbh_cm } = { ...row, ...fields };
+  const isAnswer = tree && x === row.x && y === row.y;
+  return edit(() => patched(row, fields), isAnswer ? answerOf(tree, kind, dbh_cm) : null);
+}
 
 async function patched(row, fields) {
   const version = latest(row);
@@ -190,28 +197,47 @@ const edited = () => ({
 async function turn(where, word, subjects) {
   const run = state.annotations?.run;
   settle(); // queued before
-  draft.answer = null;
   let before = null;
   const done = await edit(() => {
     before = edited();
     return call("POST", where, { subjects });
   });
   if (!done || run !== state.annotations?.run) return;
-  const after = edited();
-  const parts = Object.keys({ ...after, ...before }).map((name) => [name, differing(before[name] ?? [], after[name] ?? [])]).filter(([, changes]) => changes.length);
-  const [[name, [row, ...others]] = ["", []]] = parts;
-  const single = name === "annotation" && !others.length && parts.length === 1;
-  const tree = single ? nearest(trees(), (each) => distance(each, row), state.annotations.same_thing_m) : null;
-  const what = parts.map(([each, changes]) => count(changes.length, each)).join(", ") || "nothing changed";
-  showNews(`${word}: ${tree ? `tree ${tree.number} (${row.kind})` : what}.`);
+  const isUndo = where === "/undo", [older, newer] = isUndo ? [edited(), before] : [before, edited()];
+  const changes = Object.keys({ ...older, ...newer }).flatMap((name) => changesOf(name, older[name] ?? [], newer[name] ?? []));
+  const single = changes.length === 1 && changes[0].name === "annotation" ? changes[0] : null;
+  if (!single) return showNews(`${word}: ${countsText(changes)}.`);
+  const now = isUndo ? single.was ?? single.is : single.is ?? single.was;
+  const tree = nearest(trees(), (each) => distance(each, now), state.annotations.same_thing_m);
+  showNews(`${word}: ${changeText(single, tree)}.`);
   if (tree) select(tree.number);
 }
 
-// The rows that exist in one of both lists only, or in another version.
-function differing(before, after) {
-  const has = (list, { id, version }) => list.some((row) => row.id === id && row.version === version);
-  const gone = before.filter((row) => !has(after, row)), come = after.filter((row) => !has(before, row));
-  return [...come, ...gone.filter(({ id }) => !come.some((row) => row.id === id))];
+// {name, was, is} of each row that an edit has changed; `was` is undefined for an added row, `is` for a deleted one.
+function changesOf(name, older, newer) {
+  const [was, is] = [older, newer].map((list) => new Map(list.map((row) => [row.id, row])));
+  return [...new Set([...was.keys(), ...is.keys()])].map((id) => ({ name, was: was.get(id), is: is.get(id) }))
+    .filter((each) => each.was?.version !== each.is?.version);
+}
+
+// "2 annotations added, 1 annotation changed"
+function countsText(changes) {
+  const did = { added: ({ was }) => !was, changed: ({ was, is }) => was && is, deleted: ({ is }) => !is };
+  const parts = [...new Set(changes.map(({ name }) => name))].flatMap((name) => Object.entries(did).map(([verb, holds]) =>
+    [changes.filter((each) => each.name === name && holds(each)).length, name, verb]));
+  return parts.filter(([number]) => number).map(([number, name, verb]) => `${count(number, name)} ${verb}`).join(", ") || "nothing changed";
+}
+
+// What an edit of one annotation did; `tree` is its tree in the map, null for none.
+function changeText({ was, is }, tree) {
+  const name = tree ? `tree ${tree.number}` : `the ${(was ?? is).kind}`;
+  if (!is) return `${tree ? "annotation of " : ""}${name} deleted`;
+  if (tree && is.kind === SKIPPED) return `${name} skipped`;
+  if (tree && is.kind !== was?.kind && draft.answered.includes(is.id)) return `the answer ${statement(is.kind, is.dbh_cm)} of ${name}`;
+  if (!was) return `${is.kind} added${tree ? ` at ${name}` : ""}`;
+  if (is.kind !== was.kind) return `class of ${name} changed to ${is.kind}`;
+  if (is.dbh_cm !== was.dbh_cm) return `DBH of ${name} ${is.dbh_cm === null ? "removed" : `set to ${is.dbh_cm} cm`}`;
+  return `${name} moved`;
 }
 export const importTable = (table, unit) => edit(() => call("POST", "/import", { table, dbh_unit: unit || null }));
 
@@ -242,6 +268,12 @@ export function reviewOf(tree) {
   const row = annotationOf(tree);
   if (!row) return "open";
   return row.kind === SKIPPED ? SKIPPED : row.kind === "tree" ? "confirmed" : "rejected";
+}
+
+// The class that N stores: the chosen one, else that of what was rejected before.
+export function rejectedKind() {
+  const tree = selectedTree(), row = tree ? annotationOf(tree) : rowOf(draft.chosen);
+  return draft.kind ?? (row && !["tree", SKIPPED].includes(row.kind) ? row.kind : "other");
 }
 
 // How far the votes for a tree are from the share that is needed; the smaller, the more doubtful is the tree.
@@ -285,11 +317,13 @@ const updateVotes = throttled(async () => {
 export async function review(kind) {
   const tree = selectedTree(), row = rowOf(draft.chosen);
   if (!tree && row) return change(row, { kind }); // an annotation without a tree
-  if (!tree) {
-    draft.error = "Select a found tree first: click it on the map, or press S for the next one.";
-    return news();
-  }
+  if (!tree) return askForTree();
   await answerIfSeen(tree, kind);
+}
+
+export function askForTree() {
+  draft.error = "Select a found tree first: click it on the map, or press S for the next one.";
+  news();
 }
 
 async function answerIfSeen(tree, kind) {
@@ -334,26 +368,25 @@ export const byClick = (answers) => (event) => {
 
 async function answer(tree, kind, fields = {}, goesOn = true) {
   const { number } = tree, seen = annotationOf(tree), run = state.annotations?.run;
+  const { dbh_cm = null } = { ...seen, ...fields }, given = answerOf(tree, kind, dbh_cm);
+  Object.assign(draft, { kind: null, refused: "" });
   if (seen && Object.entries({ kind, ...fields }).every(([name, value]) => seen[name] === value)) {
-    Object.assign(draft, { answer: { number, kind, isStored: true }, kind: "other", refused: "" });
+    draft.answer = { ...given, isStored: true };
     if (goesOn && state.selected === number) await next();
     return news();
   }
   answering.add(number);
-  Object.assign(draft, { answer: { number, kind }, kind: "other", refused: "" });
   const stored = edit(async () => {
     const row = annotationOf(tree); // after the edits before this one
     const isSeen = row && row.id === seen?.id && row.version === seen.version;
     if (row && !isSeen && row.who !== myName()) throw new Error(`Tree ${number} was annotated by ${row.who} meanwhile; your answer was not stored.`);
     return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind, ...fields } : { kind, ...fields })
       : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null, ...fields });
-  });
-  const given = draft.answer;
+  }, given);
   try {
     if (goesOn && state.selected === number) await next();
     const done = await stored;
     if (done && run === state.annotations?.run) keepAnswered(done.id);
-    if (!done && draft.answer === given) draft.answer = null; // not that of a later tree
   } finally {
     answering.delete(number);
     news();
@@ -435,8 +468,24 @@ function keepAnswered(id) {
   remember(`answered.${state.annotations.run}`, JSON.stringify(draft.answered), "sessionStorage");
 }
 
-// What the last answer of the review said ("Tree 40: pole"); "" before the first one.
-export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${draft.answer.kind}${draft.answer.isStored ? ", as before" : ""}` : "");
+// What an edit states about a tree, and the diameter that the map had then.
+const answerOf = ({ number, dbh_cm: mapped, sigma_dbh_cm: sigma }, kind, dbh) => ({ number, kind, dbh, mapped, sigma });
+
+const statement = (kind, dbh) => (dbh === null ? kind : `${kind}, ${dbh} cm`);
+
+// What the last edit said about a tree ("Tree 40: tree, 31.5 cm"); "" if it said nothing about one.
+export function answerText() {
+  if (!draft.answer) return "";
+  const { number, kind, dbh, isStored } = draft.answer;
+  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${dbhDoubt(draft.answer)}`;
+}
+
+// A typed diameter that differs from that of the map by more than chance is often one in another unit.
+function dbhDoubt({ dbh, mapped, sigma }) {
+  if ([dbh, mapped, sigma].includes(null)) return "";
+  const isNear = Math.abs(dbh - mapped) <= MOST_SIGMAS * Math.hypot(sigma, state.annotations?.tape_sigma_cm ?? 0);
+  return isNear ? "" : `; the map has ${dbhFigure(mapped, sigma)} cm. In cm?`;
+}
 
 // --- the chosen annotation -------------------------------------------------------------------------------------
 
@@ -444,8 +493,8 @@ export const answerText = () => (draft.answer ? `Tree ${draft.answer.number}: ${
 export function choose(id) {
   const row = rowOf(id);
   if (row) select(treeNumberOf(row));
-  draft.chosen = id;
-  draft.error = "";
+  if (id !== draft.chosen) draft.kind = null;
+  Object.assign(draft, { chosen: id, error: "" });
   keepOneSelection();
   news();
 }
@@ -453,7 +502,7 @@ export function choose(id) {
 // What was chosen or said for one tree does not hold for the next one.
 let asked = null; // number of the tree
 function forgetTreeBefore() {
-  if (state.selected !== asked) Object.assign(draft, { kind: "other", refused: "" });
+  if (state.selected !== asked) Object.assign(draft, { kind: null, refused: "" });
   asked = state.selected;
 }
 
@@ -472,7 +521,7 @@ export function nudge(dx, dy) {
   const row = rowOf(draft.chosen);
   if (!row) return;
   const from = draft.moved ?? row;
-  draft.moved = { id: row.id, row: draft.moved?.row ?? row, x: from.x + dx, y: from.y + dy };
+  Object.assign(draft, { answer: null, moved: { id: row.id, row: draft.moved?.row ?? row, x: from.x + dx, y: from.y + dy } });
   clearTimeout(nudging);
   nudging = setTimeout(settle, NUDGE_WAIT);
   news();

@@ -9,7 +9,7 @@ import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { openTab } from "../shell/tabs.js";
-import { annotating, annotationOf, draft, following, measureDbh, news, reviewOf, typedDbh } from "./annotations.js";
+import { annotating, annotationOf, askForTree, draft, following, measureDbh, news, reviewOf, showCard, typedDbh } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
@@ -33,7 +33,7 @@ export const card = (answers, hint) => el("article", { id: "review", class: "rev
 
 // What else is known of the tree.
 export const moreEvidence = () => el("section", { id: "review-more", class: "review-more", "aria-label": "Further evidence on the tree" },
-  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" })),
+  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape in cm (D) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" })),
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
@@ -121,6 +121,7 @@ function checkedDbh(input) {
 let isEntered = false;
 function endDbh(event) {
   const { key, target } = event, tree = treeOf(Number(target.dataset.tree));
+  if (key === "d" && event.repeat) event.preventDefault(); // the key that has opened the field is still held down
   if (key !== "Enter" && key !== "Escape") return;
   event.preventDefault();
   draft.error = "";
@@ -129,7 +130,15 @@ function endDbh(event) {
   isEntered = key === "Enter";
   target.blur(); // calls takeDbh if the text was changed
   isEntered = false;
+  showCard();
+  draft.shownAt = performance.now(); // the card may have been out of view
   news();
+}
+
+export function typeDbh() {
+  if (!selectedTree()) return askForTree();
+  byId("review-dbh").focus();
+  byId("review-dbh").select();
 }
 
 function showDbh(tree) {
@@ -180,7 +189,7 @@ export function fillCard() {
     requestAnimationFrame(() => { draft.shownAt = performance.now(); });
   }
   setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
-  setText(byId("review-state"), review);
+  setText(byId("review-state"), review === "rejected" ? `rejected: ${annotationOf(tree).kind}` : review);
   byId("review-state").dataset.state = review;
   for (const id of ["review", "review-more"]) byId(id).classList.toggle("loading", old);
   byId("review").setAttribute("aria-busy", String(old));

@@ -8,12 +8,14 @@ import { select } from "../core/live_feed.js";
 import { showNews } from "../core/problem.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
+import { historyKey } from "../core/undo_keys.js";
+import { saveWritten } from "../core/written_file.js";
 import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
-import { card, fillCard, moreEvidence, startCard } from "./card.js";
+import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
+import { card, fillCard, moreEvidence, startCard, typeDbh } from "./card.js";
 import { startSection } from "./section.js";
 
 const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
@@ -26,7 +28,7 @@ let imported = ""; // result of the last import
 
 function build() {
   const kind = el("select", { id: "annotate-kind", "aria-label": "Class of a rejected tree", onchange: () => { draft.kind = kind.value; } },
-    ...KINDS.slice(1).map((each) => el("option", { value: each, text: each, selected: each === draft.kind })));
+    ...KINDS.slice(1).map((each) => el("option", { value: each, text: each })));
   kind.title = "Answered at once with Shift: P pole, H person, B bush, O other";
   const unit = el("select", { id: "annotate-unit", "aria-label": "Unit of a DBH column whose header names none" },
     ...[["", "unit of DBH in the file"], ["cm", "cm"], ["m", "m"], ["mm", "mm"]].map(([value, text]) => el("option", { value, text })));
@@ -39,7 +41,7 @@ function build() {
     button("annotate-nameless", "Not now", "Answers are stored under the name of this browser", () => { asked.hidden = true; }, "quiet small"));
   const answers = el("div", { class: "review-buttons", role: "group", "aria-label": "Is the selected found tree a tree?" },
     button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", byClick(() => review("tree")), ""),
-    button("annotate-no", "No (N)", "The selected object is not a tree; the class beside it is stored (N)", byClick(() => review(draft.kind)), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
+    button("annotate-no", "No (N)", "The selected object is not a tree; the class beside it is stored (N)", byClick(() => review(rejectedKind())), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
     button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, ""));
   byId("panel-annotate").replaceChildren(
     card(answers, el("p", { id: "annotate-hint", class: "note dim", role: "status" })),
@@ -83,10 +85,13 @@ function nameField(id) {
   return field;
 }
 
-// A link to the annotations; the file is named after the run at the time of the click.
+// A link to the annotations; the file is named after the run at the time of the click. The server sends another name, which would count.
 function truthLink(suffix, format) {
-  const name = ({ currentTarget }) => { currentTarget.download = fileName(titleOf(state.status?.source), `truth.${suffix}`); };
-  return el("a", { class: "small", href: `/api/annotations.${suffix}`, download: `truth.${suffix}`, text: `Save ${format}`, title: `Download the annotations as ${format}, with the tree numbers of the shown scan`, onclick: name });
+  const address = `/api/annotations.${suffix}`;
+  return el("a", { class: "small", href: address, text: `Save ${format}`, title: `Download the annotations as ${format}, with the tree numbers of the shown scan`, onclick: (event) => {
+    event.preventDefault();
+    saveWritten("Writing the annotations …", fileName(titleOf(state.status?.source), `truth.${suffix}`), address);
+  } });
 }
 
 async function take(file, unit) {
@@ -166,7 +171,7 @@ function fill() {
   setText(byId("annotate-error"), problem || draft.error);
   setText(byId("annotate-hint"), hint(selected && left.includes(selected) ? selected : null));
   fillCard();
-  byId("annotate-kind").value = draft.kind;
+  byId("annotate-kind").value = rejectedKind();
   byId("review-last").hidden = !answerText();
   setText(byId("review-last").firstChild, answerText());
   byId("review-back").hidden = Boolean(draft.answer?.isStored); // nothing to take back
@@ -196,6 +201,7 @@ function hint(tree) {
   if (chosen && treeNumberOf(chosen) === null) return `Your annotation (${chosen.kind}) belongs to no found tree: Y, N and the keys of the classes set its class, arrows move it, Del deletes it.`;
   if (imported) return imported;
   if (tree) return `Tree ${tree.number}, ${seenText(tree)}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?`;
+  if (trees().length && !unreviewed().length) return `${trees().length === 1 ? "The tree is" : `All ${trees().length} trees are`} reviewed. ${truthText()}`;
   if (!rows().length) return "Press Next to review the trees one by one, or Add and click on the map where a tree was missed (Shift+click in the 3D scene).";
   return truthText();
 }
@@ -233,17 +239,14 @@ const ARROWS = { ArrowLeft: [-STEP, 0], ArrowRight: [STEP, 0], ArrowUp: [0, STEP
 
 export const ANNOTATE_KEYS = [
   ["a", "in the tab Annotate: add trees by clicks on the map"], ["y n", "in the tab Annotate: the selected tree is a tree, or is not"], ["shift P H B O", "in the tab Annotate: the selected tree is a pole, a person, a bush or another object"], ["s", "in the tab Annotate: skip to the next tree to review"], ["r", "in the tab Annotate: return to the tree of the answer before"],
-  ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z", "undo and redo an edit of the tab that is open"], ["shift+click", "in the 3D scene: add a tree there"],
+  ["d", "in the tab Annotate: type the DBH by tape of the selected tree"],
+  ["← ↑ → ↓", "move the chosen annotation by 1 cm"], ["del", "delete the chosen annotation"], ["ctrl+z ctrl+shift+z ctrl+y", "undo and redo an edit of the tab that is open"], ["shift+click", "in the 3D scene: add a tree there"],
 ];
 
 // Returns whether the key belonged to the tab.
 export function annotateKey(event) {
   if (!annotating()) return false;
-  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
-    if (event.shiftKey) redo();
-    else undo();
-    return true;
-  }
+  if (historyKey(event, reviewHistory)) return true;
   if (event.ctrlKey || event.metaKey || event.altKey) return false;
   return keyOfChosen(event) || (event.repeat ? isHeld(event) : keyOfTab(event));
 }
@@ -252,7 +255,7 @@ export function annotateKey(event) {
 function isHeld({ key, shiftKey }) {
   const answers = ["y", "n", "s"].includes(key) || (shiftKey && key in CLASS_KEYS);
   if (answers) refuseHeld();
-  return answers || key === "a" || key === "r";
+  return answers || ["a", "r", "d"].includes(key);
 }
 
 function keyOfChosen(event) {
@@ -268,10 +271,11 @@ function keyOfChosen(event) {
 function keyOfTab({ key, shiftKey }) {
   if (key === "a") toggleAdding();
   else if (key === "y") review("tree");
-  else if (key === "n") review(draft.kind);
+  else if (key === "n") review(rejectedKind());
   else if (shiftKey && key in CLASS_KEYS) review(CLASS_KEYS[key]);
   else if (key === "s") skip();
   else if (key === "r") previous();
+  else if (key === "d") typeDbh();
   else if (key === "p" && draft.shown !== null) refusePlain(); // "Find a parameter" would leave the review
   else if (key === "Escape" && draft.adding) toggleAdding(false);
   else return false;

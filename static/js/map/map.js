@@ -67,8 +67,19 @@ const gapTo = (at) => (place) => {
 const clusterAt = (at) => nearest(clusters(), gapTo(at), POINT_REACH);
 const truthAt = (at) => nearest(state.truth ?? [], gapTo(at), POINT_REACH);
 
-const SAME = 0.01; // [m] between an annotation and its copy in the ground truth
-const isAnnotation = (truth) => annotations().some((row) => distance(row, truth) < SAME);
+// Index of the first object of the ground truth that has an annotation: they come last, in the order of the annotations (`laid_over`).
+function annotatedFrom() {
+  const used = ["annotations", "both"].includes(state.annotations?.used) ? annotations().length : 0;
+  return (state.truth?.length ?? 0) - used;
+}
+
+// A confirmed tree without a DBH by tape has that of the ground truth.
+function truthText(truth) {
+  const { kind, dbh_cm: dbh } = truth, row = annotations()[state.truth.indexOf(truth) - annotatedFrom()];
+  const dbhPart = dbh !== null ? dbhText(truth) : kind === "tree" ? "DBH unknown" : "";
+  if (row && row.dbh_cm === null && dbh !== null) return `Annotation: ${kind}\nGround truth: ${dbhPart}`;
+  return `${row ? "Annotation" : "Ground truth"}: ${[kind, dbhPart].filter(Boolean).join(", ")}`;
+}
 
 function describe(at) {
   let [tree, truth] = [treeAt(trees(), at, map.view), truthAt(at)];
@@ -84,7 +95,7 @@ function describe(at) {
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, `at ${placeText([tree.x, tree.y])}`, isDrive() ? seenText(tree) : `height ${heightText(tree)}`);
   else if (cluster) lines.push(`${isDrive() ? "Cluster" : "Candidate"}: ${cluster.verdict === "tree" && isDrive() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
-  if (truth) lines.push(`${isAnnotation(truth) ? "Annotation" : "Ground truth"}: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
+  if (truth) lines.push(truthText(truth));
   return lines.join("\n") || NONE;
 }
 
@@ -107,8 +118,8 @@ const isRejected = (tree) => reviewOf(tree) === "rejected";
 // The legend names what the map shows.
 function showLegend() {
   const truth = state.truth ?? [], others = [...truth.filter(({ kind }) => kind !== "tree"), ...classedThings(state)];
-  const marked = truth.filter(({ kind }) => kind === "tree"), byPeople = marked.some(isAnnotation), ofRun = marked.some((tree) => !isAnnotation(tree));
-  const shown = { truth: marked.length, other: others.length,
+  const isTree = ({ kind }) => kind === "tree", byPeople = truth.slice(annotatedFrom()).some(isTree), ofRun = truth.slice(0, annotatedFrom()).some(isTree);
+  const shown = { truth: byPeople || ofRun, other: others.length,
     hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
   setText(byId("legend-truth"), !byPeople ? "true tree" : ofRun ? "reference tree" : "annotated tree");

@@ -5,6 +5,7 @@ import { inFile, placeTexts, unitWord } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { count } from "../core/format.js";
 import { on, selectedTree, state } from "../core/store.js";
+import { historyKey } from "../core/undo_keys.js";
 import { CLASSES, deleteTree, endTool, hint, importRepairs, removeRepair, repairing, repairs, setClass, startRepairs, tool, useTool } from "./repairs.js";
 
 const TOOLS = [
@@ -113,11 +114,7 @@ export const REPAIR_KEYS = [["del", "in the tab Repair: delete the selected tree
 // Returns whether the key belonged to the tab.
 export function repairKey(event) {
   if (!repairing()) return false;
-  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
-    if (event.shiftKey) redo();
-    else undo();
-    return true;
-  }
+  if (historyKey(event, { undo, redo })) return true;
   if (event.ctrlKey || event.metaKey || event.altKey) return false;
   if (event.key === "Escape") return endTool();
   if (event.key !== "Delete" || !selectedTree()) return false;

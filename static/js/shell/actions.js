@@ -1,6 +1,7 @@
 // All actions of the dashboard in one table; the keys, the list of shortcuts and the palette are made from it.
 
-import { annotating, draft, previous, review, reviewHistory, skip, toggleAdding } from "../annotate/annotations.js";
+import { annotating, previous, rejectedKind, review, reviewHistory, skip, toggleAdding } from "../annotate/annotations.js";
+import { typeDbh } from "../annotate/card.js";
 import { byId } from "../core/dom.js";
 import { select } from "../core/live_feed.js";
 import { edits } from "../core/permissions.js";
@@ -82,9 +83,10 @@ export const ACTIONS = [
   ["Annotate: add trees by clicks on the map", "a", "", inAnnotate(() => toggleAdding(true)), ""],
   ["Annotate: skip to the next tree to review", "s", "", inAnnotate(skip), ""],
   ["Annotate: the selected tree is a tree", "y", "", inAnnotate(() => review("tree")), ""],
-  ["Annotate: the selected tree is not a tree", "n", "", inAnnotate(() => review(draft.kind)), ""],
+  ["Annotate: the selected tree is not a tree", "n", "", inAnnotate(() => review(rejectedKind())), ""],
   ...["pole", "person", "bush", "other"].map((kind) => [`Annotate: the selected tree is of the class ${kind}`, `shift ${kind === "person" ? "h" : kind[0]}`, "", inAnnotate(() => review(kind)), ""]),
   ["Annotate: return to the tree of the answer before", "r", "", inAnnotate(previous), ""],
+  ["Annotate: type the DBH by tape of the selected tree", "d", "", inAnnotate(typeDbh), ""],
   ["Annotate: delete the chosen annotation", "del", "", inAnnotate(() => document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "Delete", bubbles: true }))), "", "remove erase"],
   ["Annotate: undo your last annotation", "", "", inAnnotate(reviewHistory.undo)], ["Annotate: redo your last annotation", "", "", inAnnotate(reviewHistory.redo)],
   ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],

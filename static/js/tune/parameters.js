@@ -5,6 +5,7 @@ import { myName } from "../annotate/annotations.js";
 import { get, patch, post } from "../core/api.js";
 import { attempted } from "../core/problem.js";
 import { changed, on, state } from "../core/store.js";
+import { historyKey } from "../core/undo_keys.js";
 import { visible } from "../shell/tabs.js";
 
 export const tuning = {
@@ -72,15 +73,7 @@ export const refuse = (text) => { tuning.error = text; changed("tuning"); };
 // While the tab is open. Returns whether the key was one of them.
 export const tuneKey = (event) => isTuning() && undoKey(event);
 
-// Ctrl+Z, Ctrl+Shift+Z and Ctrl+Y. Returns whether the key was one of them.
-export function undoKey(event) {
-  if (!(event.ctrlKey || event.metaKey) || event.altKey) return false;
-  const key = event.key.toLowerCase();
-  if (key === "y" || (key === "z" && event.shiftKey)) redo();
-  else if (key === "z") undo();
-  else return false;
-  return true;
-}
+export const undoKey = (event) => historyKey(event, { undo, redo });
 
 // Why a name of a set is not accepted; empty if it is.
 export const nameProblem = (name) => (SET_NAME.test(name) ? "" : "A name begins with a letter or digit, followed by letters, digits, spaces and . + - _ (40 characters at most).");

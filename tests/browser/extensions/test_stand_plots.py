@@ -100,7 +100,7 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     expect(rows).to_have_count(3)
     canvas.press("Control+z")
     expect(rows).to_have_count(4)
-    expect(page.locator("#problem")).to_contain_text("Undone: 1 plot.")
+    expect(page.locator("#problem")).to_contain_text("Undone: 1 plot deleted.")
     for _ in range(5):
         page.locator("#plot-undo").click()
     expect(rows).to_have_count(0)

@@ -9,6 +9,7 @@ import { count, figure, percent, plusMinus, withSigma } from "../../core/format.
 import { looksOnly } from "../../core/permissions.js";
 import { isDrive, on, state, trees } from "../../core/store.js";
 import { keepFresh } from "../../core/timing.js";
+import { historyKey } from "../../core/undo_keys.js";
 import { titleOf } from "../../open/run_title.js";
 import { startCoordinates } from "./coordinates.js";
 import { fillHeading, headingFields, headingSaved, resetHeading } from "./heading.js";
@@ -282,11 +283,7 @@ function fill() {
 // Returns whether the key belonged to the tab.
 export function plotKey(event) {
   if (!plotting()) return false;
-  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
-    if (event.shiftKey) redo();
-    else undo();
-    return true;
-  }
+  if (historyKey(event, { undo, redo })) return true;
   if (!drawing()) return false;
   if (event.key === "Escape") stopDrawing();
   else if (event.key === "Enter" && sketch.kind === "polygon") finish();
