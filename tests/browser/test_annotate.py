@@ -880,7 +880,7 @@ def test_the_map_names_the_source_of_class_and_dbh(person: Dashboard):
         (other, f"Ground truth: tree, DBH {other['dbh_cm']:.1f} cm"),
     ):
         page.locator("#map").hover(position=place_of(person, place["x"], place["y"]))
-        person.eventually(lambda text=text: tip.inner_text().endswith(text), tip.inner_text)
+        expect(tip).to_contain_text(text)
 
 
 def test_accumulated_points_lie_under_the_map_of_the_tab(person: Dashboard):
@@ -1102,8 +1102,8 @@ def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_nam
     page, hint = person.page, person.page.locator("#annotate-hint")
     trees = person.ask("/api/trees")["trees"]
     table = "x_m,y_m,class\n" + "".join(f"{tree['x']},{tree['y']},tree\n" for tree in trees)
-    file = {"name": "plot.csv", "mimeType": "text/csv", "buffer": table.encode()}
-    page.locator("#annotate-file").set_input_files(file)
+    file = page.locator("#annotate-file")
+    file.set_input_files({"name": "plot.csv", "mimeType": "text/csv", "buffer": table.encode()})
     expect(hint).to_contain_text(f"{len(trees)} trees imported from plot.csv")
     page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({trees[0]['number']}))")
     expect(hint).to_contain_text(f"All {len(trees)} trees are reviewed.")
@@ -1112,8 +1112,8 @@ def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_nam
     assert download.value.suggested_filename == "sim_stand_truth.csv"
     lines = download.value.path().read_text(encoding="utf-8").splitlines()
     lines[1], lines[2] = lines[1].replace(",,tree,", ",31.5,tree,"), lines[2].replace(",tree,", ",pole,")
-    file["buffer"] = "\n".join(lines).encode()
-    page.locator("#annotate-file").set_input_files(file)
+    table = "\n".join(lines)
+    file.set_input_files({"name": "plot.csv", "mimeType": "text/csv", "buffer": table.encode()})
     expect(hint).to_contain_text(
         "0 trees imported from plot.csv; 1 diameter added; 1 differs from its annotation and was left out: "
         f"tree {trees[1]['number']} is tree here, pole in the file; {len(trees) - 2} left out because"
