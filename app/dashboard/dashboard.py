@@ -488,8 +488,7 @@ class Dashboard:
         await self.annotation_editor.follow(shown.repairs, shown.frame.trees)
         if number != self._opens:
             return
-        distance = self.parameters.parameters.evaluation.match_distance
-        payload = await asyncio.to_thread(map_payload, shown, self.truth, distance)
+        payload = await asyncio.to_thread(map_payload, shown, self.truth, self.parameters.parameters)
         if number != self._opens:  # another source was requested meanwhile
             return
         payload["layers"] |= self.scene.counts

@@ -15,8 +15,10 @@ from app.common.height_range import height_range
 from app.explain.records import half_axes
 from app.worker.course import QUANTITIES
 from app.worker.protocol import RunCourse, Shown
+from pipeline.config import Parameters
+from pipeline.geometry.arcs import along_arc
 from pipeline.repairs.record import identity_of
-from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict
+from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict, Zone
 from pipeline.types.units import SECOND_NS
 
 Float = NDArray[np.float64]
@@ -25,20 +27,21 @@ Float = NDArray[np.float64]
 _DIGITS = 4
 
 
-def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
+def map_payload(shown: Shown, truth: TruthTrees | None, parameters: Parameters) -> dict[str, Any]:
     """Return the message "map" without its path and without points as a dict of JSON values.
 
     The keys are `type`, "map"; `index` and `time_s` of the scan [s since the first scan]; `pose` and `odom`,
     lists [x [m], y [m], yaw [rad]] of `T_map_base` and `T_odom_base`; `sigma_xy`, the root mean square of the
     standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; `health`, `trees`, `clusters`,
-    `layers` and `clearance`, the results of the functions of this module; `loops`, pairs of scans,
-    `problems`, `repaired_numbers` and `agreeing`, as in `Shown`; `repairs`, the `identity_of` the repairs to
-    which they belong; `intensity`, `has_intensity` of `Shown`; `height_range`, the heights at the ends of the
-    colour ramp [m], see `height_range`; and the keys of `counts_of`.
+    `layers`, `clearance` and `obstacle`, the results of the functions of this module; `loops`, pairs of
+    scans, `problems`, `repaired_numbers` and `agreeing`, as in `Shown`; `repairs`, the `identity_of` the
+    repairs to which they belong; `intensity`, `has_intensity` of `Shown`; `height_range`, the heights at the
+    ends of the colour ramp [m], see `height_range`; and the keys of `counts_of`.
 
     Args:
         shown: The scan with the map.
-        truth, match_distance: As in `counts_of`.
+        truth: As in `counts_of`.
+        parameters: The parameters in force.
     """
     frame = shown.frame
     estimate = frame.estimate
@@ -54,9 +57,10 @@ def map_payload(shown: Shown, truth: TruthTrees | None, match_distance: float) -
         "trees": trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * SECOND_NS)),
         "clusters": clusters_payload(frame),
         "counts": dict(frame.counts),
-        **counts_of(frame, truth, match_distance),
+        **counts_of(frame, truth, parameters.evaluation.match_distance),
         "layers": layer_counts(frame),
         "clearance": clearance_payload(frame.clearance),
+        "obstacle": obstacle_payload(frame, parameters.obstacles.width),
         "intensity": shown.has_intensity,
         "height_range": [round(height, 1) for height in height_range(frame)],
         "loops": shown.loops.tolist(),
@@ -101,6 +105,29 @@ def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
         return None
     ahead, beside = _known(clearance.ahead), _known(clearance.beside)
     return {"zone": clearance.zone.label, "ahead_m": ahead, "beside_m": beside, "within_m": clearance.within}
+
+
+_SECTIONS = 8  # of a side of the path on the 2D map
+
+
+def obstacle_payload(frame: Frame, width: float) -> dict[str, Any] | None:
+    """Return the nearest obstacle in the slow or stop zone as a dict with `x` and `y` in the map [m], and
+    `outline`, the corners [x, y] of the path that is checked [m]; None without an obstacle in these zones.
+
+    Args:
+        frame: Results of the scan.
+        width: Width of the path [m].
+    """
+    clearance = frame.clearance
+    if clearance is None or clearance.zone not in (Zone.SLOW, Zone.STOP):
+        return None
+    s = np.linspace(clearance.begins, clearance.begins + clearance.within, _SECTIONS + 1)
+    right, left = (
+        along_arc(s, side, clearance.curvature, clearance.backward) for side in (-0.5 * width, 0.5 * width)
+    )
+    place = frame.estimate.T_map_base.apply(np.vstack([(clearance.x, clearance.y), right, left[::-1]]))
+    (x, y), *outline = np.round(place, 3).tolist()
+    return {"x": x, "y": y, "outline": outline}
 
 
 def health_payload(health: Health) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
 from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Mesh, Node, Segments
 from pipeline.config.stages import Obstacles
+from pipeline.geometry.arcs import along_arc
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Frame, Zone
 
@@ -206,18 +207,5 @@ def way_lines(curvature: float, backward: bool, begins: float, parameters: Obsta
 
 
 def _on_way(s: Float, left: float | Float, curvature: float, backward: bool) -> Float:
-    """Return points at a lateral distance from the path ahead, shape (N, 3) [m], in the level base frame, at
-    HEIGHT.
-
-    Args:
-        s: Distances along the path from the base, shape (N,) [m].
-        left: Distance to the left of the path [m], scalar or shape (N,).
-        curvature: Curvature of the path [1/m], positive to the left; below 1e-6 the path is straight.
-        backward: Whether the robot drives backward; then x is negated.
-    """
-    if abs(curvature) < 1e-6:
-        x, y = s, np.zeros_like(s) + left
-    else:
-        radius, angle = 1.0 / curvature, s * curvature
-        x, y = (radius - left) * np.sin(angle), radius - (radius - left) * np.cos(angle)
-    return np.column_stack([-x if backward else x, y, np.full(len(s), HEIGHT)])
+    """Return the points of `along_arc` at HEIGHT, shape (N, 3) [m]."""
+    return np.column_stack([along_arc(s, left, curvature, backward), np.full(len(s), HEIGHT)])

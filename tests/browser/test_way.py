@@ -35,6 +35,55 @@ def test_a_person_in_the_way_is_reported(dashboard: Dashboard):
             expect(way).to_be_hidden()
 
 
+# Whether the ring around the nearest obstacle is painted on the 2D map in the colour of its zone while the
+# run is in a state; in its own state if that is "".
+RING = """async (word) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const { colour } = await import('/static/js/core/theme.js');
+  const { screenOf } = await import('/static/js/map/map.js');
+  const frame = () => new Promise(requestAnimationFrame);
+  const real = state.status;
+  if (word) {
+    state.status = { ...real, state: word };
+    changed('status');
+  }
+  await frame();
+  await frame();
+  const { zone } = state.map.clearance, canvas = document.getElementById('map');
+  const { x, y } = state.map.obstacle;
+  const [px, py] = screenOf(x, y), radius = Math.max(12, screenOf(x + 0.3, y)[0] - px);
+  const pen = canvas.getContext('2d'), wanted = colour(zone === 'stop' ? 'pole' : 'warn').toLowerCase();
+  const isPainted = ([px, py]) => {
+    const { data } = pen.getImageData(px * devicePixelRatio, py * devicePixelRatio, 1, 1);
+    return wanted === '#' + [...data.slice(0, 3)].map((each) => each.toString(16).padStart(2, '0')).join('');
+  };
+  const isSeen = [[px, py - radius], [px - radius, py], [px, py + radius]].some(isPainted);
+  state.status = real;
+  changed('status');
+  return isSeen;
+}"""
+NAMED = "() => document.getElementById('legend-obstacle').checkVisibility()"
+THEME = "async (name) => (await import('/static/js/core/theme.js')).setTheme(name)"
+
+
+def test_the_map_marks_the_obstacle_while_it_is_reported(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.open("sim:crossing?duration=12")
+    dashboard.pause()
+    dashboard.command({"type": "seek", "time_s": 10.6})
+    expect(page.locator("#way")).to_contain_text("Stop: obstacle")
+    dashboard.until(NAMED)
+    for width, theme in ((390, "dark"), (390, "light"), (1440, "light"), (1440, "dark")):
+        page.set_viewport_size({"width": width, "height": 844})
+        page.evaluate(THEME, theme)
+        dashboard.drawn()
+        assert page.evaluate(RING, ""), (width, theme)
+    assert not page.evaluate(RING, "finished"), "the data are old"
+    assert page.evaluate(RING, "")
+    dashboard.command({"type": "seek", "time_s": 6.5})
+    dashboard.until("() => !document.getElementById('legend-obstacle').checkVisibility()")
+
+
 # Whether the line about the obstacle is seen: nothing lies on it.
 ON_TOP = """() => {
   const way = document.getElementById('way'), box = way.getBoundingClientRect();

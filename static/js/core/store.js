@@ -16,6 +16,7 @@ export const state = {
   place: null,       // [x, y, z] of the selection on the ground, once the server has answered
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when selected
   selectedTruth: null, // object of the ground truth without a tree or a cluster of this scan, when clicked
+  obstacle: null,    // {x, y, outline, zone: "slow" or "stop"} ahead of the robot, while it is reported below the strip
   view: null,        // layers and choices of the 3D scene
   ghost: null,       // `remapped` or `rough` while the previous map is drawn as an overlay
   compare: null,     // clusters of the current scan by set A and by set B, while they are compared

@@ -15,6 +15,7 @@ const SECTORS = 36; // around a trunk
 const LEFT_OUT = 0.2; // opacity of trees that the filter of the table leaves out
 const DIAMOND = 8; // [px] from the centre of a diamond to its corners
 const TREE_REACH = 14; // [px] around the symbol of a tree
+const OBSTACLE = 0.3, LEAST_OBSTACLE = 12; // [m], [px] radius of the ring around the nearest obstacle, as in the scene
 
 // The tree at a point of the canvas [px], or null.
 export const treeAt = (trees, [px, py], view) => nearest(trees, (tree) => {
@@ -51,6 +52,7 @@ function drawContent(pen, view, state, isRejected) {
   state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0));
   drawNumbers(pen, view, trees.filter((tree) => !isLeftOut(tree)), state.selected, { robot: state.map && !state.status?.one_step && view.toScreen(...state.map.pose) });
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster);
+  if (state.obstacle) drawObstacle(pen, view, state.obstacle);
   if (state.map && !state.status?.one_step) drawRobot(pen, view, state.map);
   if (state.measure?.to) drawMeasure(pen, view, state.measure);
 }
@@ -246,6 +248,17 @@ function drawCross(pen, px, py, reach) {
     pen.lineTo(px + reach, py + side * reach);
   }
   pen.stroke();
+}
+
+// The nearest obstacle in the way of the robot, and the outline of the path ahead.
+function drawObstacle(pen, view, { x, y, outline, zone }) {
+  const colour = zone === "stop" ? colours.pole : colours.warn, [px, py] = view.toScreen(x, y);
+  for (const [edge, width] of [[colours.surface, 7], [colour, 4]]) { // readable on any ground
+    Object.assign(pen, { strokeStyle: edge, lineWidth: width });
+    drawCircle(pen, px, py, Math.max(LEAST_OBSTACLE, OBSTACLE * view.scale));
+    pen.stroke();
+  }
+  drawLine(pen, view, [...outline, outline[0]], colour, 1.2);
 }
 
 function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }) {

@@ -29,7 +29,7 @@ const byTool = (name, ...args) => ofExtensions("mapTools").some((tool) => tool[n
 const map = new MapCanvas(canvas, {
   top: BUTTONS_HEIGHT,
   tip: byId("map-tip"),
-  bounds: () => (state.path.length + trees().length ? boundsOf(state.path, trees()) : boundsOf(state.truth ?? [])),
+  bounds: () => (state.path.length + trees().length ? boundsOf(state.path, trees(), state.obstacle?.outline ?? []) : boundsOf(state.truth ?? [])),
   describe,
   paint(pen, view) {
     drawSection(pen, view);
@@ -120,7 +120,7 @@ function showLegend() {
   const truth = state.truth ?? [], others = [...truth.filter(({ kind }) => kind !== "tree"), ...classedThings(state)];
   const isTree = ({ kind }) => kind === "tree", byPeople = truth.slice(annotatedFrom()).some(isTree), ofRun = truth.slice(0, annotatedFrom()).some(isTree);
   const shown = { truth: byPeople || ofRun, other: others.length,
-    hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
+    hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, obstacle: Boolean(state.obstacle), ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
   setText(byId("legend-truth"), !byPeople ? "true tree" : ofRun ? "reference tree" : "annotated tree");
   const kinds = [...new Set(others.map(({ kind }) => kind))].sort(), named = kinds.map((kind) => `${verdictOf(kind)[0]} ${kind}`).join(", ");
@@ -173,6 +173,6 @@ export function startMap() {
   byId("map-csv").addEventListener("click", () => saveCsv("map.csv", tableOfMap()));
   byId("map-fit").addEventListener("click", () => map.fit());
   on("annotating", showNextToReview);
-  on("map truth annotations tab ghost", throttled(showLegend, LEGEND_EVERY));
-  on("map truth filter selection measure tab annotations annotating sketch section compare ghost theme", map.redraw);
+  on("map truth annotations tab ghost obstacle", throttled(showLegend, LEGEND_EVERY));
+  on("map truth filter selection measure tab annotations annotating sketch section compare ghost theme obstacle", map.redraw);
 }

@@ -240,6 +240,7 @@ function showWay() {
   const text = silence ? `■ ${silence.what}` : clearance && !quiet && WAY[clearance.zone];
   way.hidden = !text;
   way.dataset.zone = silence ? (silence.for_s > OLD_AFTER / 1000 ? "silent" : "slow") : clearance?.zone ?? "";
+  showObstacle(text && !silence && state.map.obstacle ? { ...state.map.obstacle, zone: clearance.zone } : null);
   const [zone, distance, why] = way.children;
   if (text) setText(zone, text);
   setText(distance, silence ? ` for ${silence.for_s} s` : clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
@@ -247,6 +248,13 @@ function showWay() {
   // An open dialog covers everything outside of it.
   const place = [...document.querySelectorAll("dialog:modal")].at(-1) ?? document.querySelector(".strip");
   if (way.parentElement !== place) place.append(way);
+}
+
+// The map draws it as long as it is reported.
+function showObstacle(obstacle) {
+  const hasChanged = obstacle?.zone !== state.obstacle?.zone;
+  state.obstacle = obstacle;
+  if (hasChanged) changed("obstacle");
 }
 
 let ahead = null; // [ms] of the server's clock before that of this machine; null while unknown

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from app.dashboard.broadcast import Broadcast
-from app.dashboard.payload import clearance_payload, ellipses
+from app.dashboard.payload import clearance_payload, ellipses, obstacle_payload
 from pipeline.geometry.columns import first_difference
+from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Clearance, Zone
+from tests.app.fakes import frame
 
 
 async def following(stream: Any, n: int) -> list[dict[str, Any]]:
@@ -98,3 +102,17 @@ def test_the_page_is_told_how_far_the_way_is_free() -> None:
     assert clearance_payload(None) is None
     told = clearance_payload(Clearance(Zone.SLOW, 1.23456, within=3.0))
     assert told == {"zone": "slow", "ahead_m": 1.235, "beside_m": None, "within_m": 3.0}
+
+
+def test_the_page_is_told_where_the_obstacle_is_on_the_map() -> None:
+    ahead = Clearance(Zone.STOP, 0.7, 0.0, x=1.2, y=0.1, curvature=0.0, within=3.0, begins=0.4)
+    shot = frame(0, 0)
+    turned = replace(shot.estimate, T_map_base=Pose2(10.0, 20.0, np.pi / 2))
+    told = obstacle_payload(replace(shot, estimate=turned, clearance=ahead), 0.9)
+    assert told is not None
+    assert (told["x"], told["y"]) == (9.9, 21.2)
+    # From the end of the robot to the end of the slow zone, as wide as the path.
+    assert np.ptp(told["outline"], axis=0).tolist() == pytest.approx([0.9, 3.0])
+    assert np.mean(told["outline"], axis=0).tolist() == pytest.approx([10.0, 21.9])
+    for zone in (Zone.CLEAR, Zone.UNKNOWN):
+        assert obstacle_payload(replace(shot, clearance=Clearance(zone)), 0.9) is None
