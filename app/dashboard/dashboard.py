@@ -511,8 +511,8 @@ class Dashboard:
             self.scores.ask(self.shown.frame.trees, self.path, self.truth, self.parameters.parameters)
 
     def _set_status(self, status: protocol.Status) -> None:
-        """Broadcast a status of the worker, and add events for new warnings. While paused, a notice replaces
-        its detail."""
+        """Broadcast a status of the worker, and add events for new warnings, a silence and the recording.
+        While paused, a notice replaces its detail."""
         if self._notice and status.state == "paused":
             status = replace(status, detail=self._notice)
         has_ended = status.live and status.state == "finished" != self.status.state
@@ -530,6 +530,7 @@ class Dashboard:
         is_new = self.events.warned(status.warnings, status.time_s)
         if status.live and status.state == "waiting":
             is_new |= self.events.silent(status.detail, status.time_s)
+        is_new |= self.events.recorded(status.recording, status.recorded_file, status.time_s)
         if is_new:
             self._broadcast_events()
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,9 +14,9 @@ import numpy as np
 from pipeline.config.model import Value
 from pipeline.types.records import Float, Frame, Zone
 
-Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "silence"]
+Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "slow", "silence", "recording"]
 
-_LASTING_KINDS = ("health", "stop", "silence")
+_OF_THE_SCANS = ("health", "stop", "slow", "silence")  # they end when the robot sends no data
 _OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
 #: Count at the end of a warning, such as "scans lost on the network (3)".
@@ -30,20 +31,24 @@ class Event:
     Attributes:
         time_s: Time since the first scan of the run [s].
         kind: Tree mapped, warning, parameters changed, pose quality changed, annotation, obstacle in the stop
-            zone, or robot without data.
+            or slow zone, robot without data, or recording.
         text: Description for people.
-        lasts: Whether it lasts until the next event of its kind, or until the robot sends no data.
+        lasts: Whether it lasts until the next event of its kind; also until the robot sends no data, except a
+            recording.
+        noted_s: Time by the clock of this computer when it was noted [s since 1970]; None if it was noted
+            again later, by a map with other parameters.
     """
 
     time_s: float
     kind: Kind
     text: str
     lasts: bool = False
+    noted_s: float | None = None
 
 
 class Events:
-    """Events of a run, at most 400. Beyond them the oldest trees are removed first, then warnings and edits,
-    and stops, silences and the pose quality last.
+    """Events of a run, at most 400. Beyond them the oldest trees are removed first, then obstacles in the
+    slow zone, then warnings and edits, and stops, silences, recordings and the pose quality last.
 
     After a change of parameters, events later than the current scan remain, flagged as from before the
     change, until the run reaches them again.
@@ -75,8 +80,8 @@ class Events:
 
         A tree that is confirmed again after stepping back keeps the event of its first confirmation. Flagged
         events up to this time are removed. The pose quality has an event when its state changes; a run begins
-        as "good". An obstacle in the stop zone has an event when it comes and goes. A silence ends, except
-        where the scan before it is shown again, for example after a change of parameters.
+        as "good". An obstacle in the stop or slow zone has an event when it comes and goes. A silence ends,
+        except where the scan before it is shown again, for example after a change of parameters.
 
         Args:
             frame: Shown frame; while seeking, not every frame is shown.
@@ -98,16 +103,20 @@ class Events:
         return self._events.keys() != known or bool(passed)
 
     def _note_changes(self, frame: Frame, time_s: float) -> None:
-        """Add the events of the pose quality, of an obstacle in the stop zone and of a silence that ends."""
+        """Add the events of the pose quality, of obstacles in the zones and of a silence that ends."""
         health = frame.health
         if health.state != self._health:
             self._health = health.state
             text = f"SLAM {health.state}: {health.reason}" if health.reason else f"SLAM {health.state}"
             self._note(f"health {frame.index}", Event(time_s, "health", text, health.state != "good"))
         ahead = frame.clearance
-        is_stop = ahead is not None and ahead.zone == Zone.STOP
-        stop = f"Obstacle in the stop zone, {ahead.ahead:.1f} m ahead" if ahead is not None else ""
-        self._turn("stop", is_stop, time_s, stop if is_stop else "No obstacle in the stop zone")
+        kinds: tuple[tuple[Kind, Zone], ...] = (("stop", Zone.STOP), ("slow", Zone.SLOW))
+        for kind, zone in kinds:
+            text = f"obstacle in the {kind} zone"
+            if ahead is not None and ahead.zone == zone:
+                self._turn(kind, True, time_s, f"{text.capitalize()}, {ahead.ahead:.1f} m ahead")
+            else:
+                self._turn(kind, False, time_s, f"No {text}")
         self._turn("silence", False, time_s, "Data again")
 
     def silent(self, why: str, time_s: float) -> bool:
@@ -122,9 +131,20 @@ class Events:
         if not self._turn("silence", True, time_s, why[:_LONGEST]):
             return False
         self._silent_since = time_s
-        self._lasting -= {"stop"}
+        self._lasting -= {"stop", "slow"}
         self._health = "good" if self._health == "good" else "unknown"
         return True
+
+    def recorded(self, recording: str, file: str, time_s: float) -> bool:
+        """Add an event when the recording of a robot begins or ends; return whether it was added.
+
+        Args:
+            recording, file: `recording` and `recorded_file` of the status.
+            time_s: Time of the last scan [s since the first scan].
+        """
+        is_on = recording.startswith(("recording", "finishing"))
+        text = "Recording" if is_on else f"{recording[:1].upper()}{recording[1:]}"
+        return self._turn("recording", is_on, time_s, f"{text}: {file}"[:_LONGEST])
 
     def remapped(self, confirmed: list[tuple[int, float]], time_s: float, *, live: bool = False) -> None:
         """Replace the events of trees by those of `confirmed`, and remove those of the pose quality, after
@@ -142,7 +162,7 @@ class Events:
         if not live:
             self._health = "good"
         for number, at in confirmed:
-            self._note(f"tree {number}", Event(at, "tree", f"Tree {number} mapped"))
+            self._note(f"tree {number}", Event(at, "tree", f"Tree {number} mapped"), now=False)
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
         """Add events for warnings that were not active in the last call, without the count at their end,
@@ -197,8 +217,8 @@ class Events:
     def as_plain(self) -> dict[str, Any]:
         """Return {"events": [...]}, a list of a dict for each event, ordered by time, with `t` [s since the
         first scan], `kind` and `text`. Events that last also have `for_s`, their duration [s], None while
-        they last; events from before a change of parameters `before`, True. The latter are included only up
-        to a total of _MOST events."""
+        they last; events with a known `noted_s` have it; events from before a change of parameters `before`,
+        True. The latter are included only up to a total of _MOST events."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]
@@ -210,8 +230,10 @@ class Events:
             if event.lasts:
                 end_s = ends.get(event.kind)
                 each["for_s"] = None if end_s is None else round(end_s - event.time_s, 2)
+            if event.noted_s is not None:
+                each["noted_s"] = round(event.noted_s, 1)
             is_silence = event.kind == "silence" and event.lasts
-            ends |= dict.fromkeys(_LASTING_KINDS if is_silence else (event.kind,), event.time_s)
+            ends |= dict.fromkeys(_OF_THE_SCANS if is_silence else (event.kind,), event.time_s)
             plain.append({**each, "before": True} if old else each)
         return {"events": plain[::-1]}
 
@@ -242,9 +264,10 @@ class Events:
         rows = np.flatnonzero(frame.trees.confirmed & np.isfinite(confirmed_s))
         return dict(zip(frame.trees.number[rows].tolist(), confirmed_s[rows].tolist(), strict=True))
 
-    def _note(self, key: str, event: Event) -> None:
-        """Add an event unless one has its key; beyond _MOST, remove the oldest of those that go first."""
-        self._events.setdefault(key, event)
+    def _note(self, key: str, event: Event, *, now: bool = True) -> None:
+        """Add an event, which happened `now` or earlier, unless one has its key; beyond _MOST, remove the
+        oldest of those that go first."""
+        self._events.setdefault(key, replace(event, noted_s=time.time()) if now else event)
         while len(self._events) > _MOST:
             del self._events[min(self._events, key=lambda known: _goes(self._events[known].kind))]
 
@@ -252,4 +275,4 @@ class Events:
 def _goes(kind: Kind) -> int:
     """Return the place of a kind in the order in which events are removed: what an operator is asked for
     afterwards goes last."""
-    return 0 if kind == "tree" else 2 if kind in _LASTING_KINDS else 1
+    return {"tree": 0, "slow": 1, "warning": 2, "change": 2, "annotation": 2}.get(kind, 3)

@@ -123,6 +123,8 @@ def link_for(address: Address) -> MakeLink:
 #: The nodes of a robot start one after another: topics are chosen this long after the first scan topic [s].
 _SETTLE_S = 1.0
 _POLL_S = 0.005
+#: Ends of the notices when the scans of a robot are not announced any more, and when they are again.
+GONE, BACK = "sends no scans any more", "sends scans again"
 #: A longer silence is reported [s]; a LiDAR of 5 Hz pauses for 0.2 s.
 SILENT_S = 1.0
 #: Path and trees are published and recorded at this interval [s]; the pose at every scan.
@@ -504,11 +506,7 @@ class LiveSource:
         there = any(p.topic == scan and p.msgtype in SCAN_TYPES for p in publishers)
         if there != self._there:
             if self._there is not None:
-                self._notices.append(
-                    f"{self._name()} sends scans again"
-                    if there
-                    else f"{self._name()} sends no scans any more"
-                )
+                self._notices.append(f"{self._name()} {BACK if there else GONE}")
             self._there = there
 
     def _choose(self) -> None:

@@ -20,7 +20,7 @@ from app.common.settings import DEFAULT_BUDGET, RunBudget
 from app.explain import build as stories
 from app.robot.link import LOST_SCANS
 from app.robot.recorder import Recorder
-from app.robot.source import LiveSource
+from app.robot.source import BACK, GONE, LiveSource
 from app.sources.one_step import OneStepSource
 from app.worker.one_step_run import OneStepRun
 from app.worker.protocol import (
@@ -154,7 +154,8 @@ class Session:
     def listen(self) -> Opened | None:
         """Process what a live robot sent, without waiting. Return its run, opened and paused before the first
         scan, in the call in which its description becomes known; None in all other calls, and without a live
-        robot. The notices of the robot become warnings of the session and, once it is open, of the run.
+        robot. The notices of the robot become warnings of the session and, once it is open, of the run. The
+        session's warning that the robot sends no scans ends when it sends again.
 
         Raises:
             SourceError: What it sends cannot be read, or the odometry is not available for it.
@@ -165,7 +166,11 @@ class Session:
             return None
         is_heard = self.run is None and self._robot.listen()
         notices = self._robot.notices()
-        self._warn(notices)
+        for notice in notices:
+            if notice.endswith(BACK):  # no warning: it ends one
+                self._warnings.pop(notice.replace(BACK, GONE), None)
+            else:
+                self._warn([notice])
         opened = self._begin(self._robot, self._request) if is_heard else None
         if isinstance(self.run, Run):
             self.run.warnings += notices

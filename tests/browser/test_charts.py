@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from playwright.sync_api import expect
 
@@ -70,15 +72,19 @@ def test_quantities_are_chosen_have_one_cursor_and_a_click_goes_there(dashboard:
 
 
 # Events as of a live run, whose clock is known.
-LOGGED = """async () => {
+LOGGED = """async (live) => {
   const { state, changed } = await import('/static/js/core/store.js');
+  const { receive } = await import('/static/js/core/live_feed.js');
+  receive('status', () => {}); // the one below stays
   state.events = [
     { t: 2, kind: 'tree', text: 'Tree 1 mapped' },
-    { t: 65, kind: 'stop', text: 'Obstacle, 0.8 m ahead', for_s: 3.25 },
+    { t: 65, kind: 'stop', text: 'Obstacle, 0.8 m ahead', for_s: 3.25, noted_s: 1795997106 },
     { t: 68.25, kind: 'stop', text: 'No obstacle in the stop zone' },
     { t: 70, kind: 'silence', text: 'gone', for_s: null },
   ];
   state.eventsStart = 1764460800;
+  state.status = { ...state.status, live };
+  changed('status');
   changed('events');
 }"""
 
@@ -88,21 +94,26 @@ def test_the_log_lists_stops_and_silences_with_their_times(dashboard: Dashboard)
     dashboard.pause()
     dashboard.tab("Charts")
     page.locator("#chart-choice").select_option("log")
-    page.evaluate(LOGGED)
-    rows = page.locator("#log tbody tr")
+    rows, titles = page.locator("#log tbody tr"), page.locator("#log th")
+    page.evaluate(LOGGED, False)
+    expect(titles).to_have_text(["run", "robot's clock", "lasted", "what"])
+    page.evaluate(LOGGED, True)
+    expect(titles).to_have_text(["run", "computer's clock", "robot's clock", "lasted", "what"])
     expect(rows).to_have_count(2)
-    expect(rows.first.locator("td").first).to_have_text("1:05.0")
-    expect(rows.first).to_contain_text("3.25 s")
-    expect(rows.last).to_contain_text("lasts")
+    expect(rows.first).to_contain_text("lasts")  # the newest first
+    expect(rows.last.locator("td").first).to_have_text("1:05.0")
+    expect(rows.last).to_contain_text("3.25 s")
     page.locator("#log-kind").select_option("tree")
     expect(rows).to_have_count(1)
     page.locator("#log-kind").select_option("lasting")
     with page.expect_download() as saved:
         page.locator("#chart-csv").click()
     assert saved.value.path().read_text().splitlines() == [
-        "time_s,date,kind,duration_s,what",
-        '65,2025-11-30T00:01:05.000Z,stop,3.25,"Obstacle, 0.8 m ahead"',
-        "70,2025-11-30T00:01:10.000Z,silence,,gone",
+        "time_s,computer_clock,robot_clock,kind,duration_s,what",
+        '65,2026-11-30T00:05:06.000Z,2025-11-30T00:01:05.000Z,stop,3.25,"Obstacle, 0.8 m ahead"',
+        "70,,2025-11-30T00:01:10.000Z,silence,,gone",
     ]
+    assert re.fullmatch(r"sim_stand_log_2025-11-(29|30)\.csv", saved.value.suggested_filename)
     page.locator("#chart-choice").select_option("time")
     expect(page.locator("#log")).to_be_hidden()
+    page.reload()

@@ -133,20 +133,25 @@ def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: 
     expect(page.locator("#state b")).to_have_text("Paused")
 
 
-WARN = """async () => {
+WARN = """async (live) => {
   const { state, changed } = await import("/static/js/core/store.js");
   const warnings = [1, 2, 3].map((n) => `Scan ${n} has ${10 * n} points only`).concat("The clock went back");
   state.status = { ...state.status, warnings };
   state.events = [...state.events, { t: 12.0, kind: "warning", text: "Scan 3 has 30 points only" }];
+  state.status.live = live;
   changed("status");
+  return document.querySelector("#warnings li").innerText;
 }"""
 
 
 def test_equal_warnings_are_one_line_that_leads_to_the_last(dashboard: Dashboard):
     page = dashboard.page
-    page.evaluate(WARN)
-    page.locator("#warnings-button").click()
     lines = page.locator("#warnings li")
+    assert (
+        page.evaluate(WARN, True) == "Scan 3 has 30 points only (3 times) at 0:12.0"
+    )  # no seek in a live run
+    page.evaluate(WARN, False)
+    page.locator("#warnings-button").click()
     expect(lines).to_have_count(2)
     expect(lines.first).to_contain_text("Scan 3 has 30 points only (3 times)")
     lines.first.get_by_role("button", name="0:12.0").click()

@@ -21,7 +21,7 @@ export const state = {
   ghost: null,       // `remapped` or `rough` while the previous map is drawn as an overlay
   compare: null,     // clusters of the current scan by set A and by set B, while they are compared
   measure: null,     // {from, to, fixed} while a distance is measured on the map
-  events: [],        // [{t, kind, text, for_s}] in order of time
+  events: [],        // [{t, kind, text, for_s, noted_s}] in order of time
   eventsStart: 0,    // time of the first scan [s since 1970]
   remapped: null,    // {revision, scans, before, after, ghost: [[x, y, dbh]], changes: [{kind, number, x, y, why}]}
   rough: null,       // {revision, places: [[x, y]], ghost, changes}: preview of a re-mapping, not a score

@@ -7,14 +7,14 @@ import { attempted, showProblem } from "../core/problem.js";
 import { roving } from "../core/roving.js";
 import { on, state } from "../core/store.js";
 
-export const NAMES = { tree: "tree mapped", warning: "warning", change: "parameters changed", health: "SLAM health", annotation: "annotated", stop: "stop zone", silence: "no data" };
+export const NAMES = { tree: "tree mapped", warning: "warning", change: "parameters changed", health: "SLAM health", annotation: "annotated", stop: "stop zone", slow: "slow zone", silence: "no data", recording: "recording" };
 const keepTabStop = roving(byId("marks"), ".mark", "horizontal");
 let start = null; // start of a loop whose end is not set yet [s]
 
 function showMarks() {
   const end = state.status?.end_s;
   const lane = byId("marks");
-  const events = end > 0 ? (state.events ?? []) : [];
+  const events = end > 0 ? state.events.filter(({ kind }) => kind !== "slow") : []; // there are many; the log lists them
   const key = `${end} ${events.length} ${events.at(-1)?.text} ${events.map((event) => `${event.t}${event.before ? "b" : ""}`).join()}`;
   if (lane.dataset.shown === key) return;
   lane.dataset.shown = key;

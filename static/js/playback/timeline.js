@@ -106,12 +106,11 @@ function showWarnings(warnings) {
   button.hidden = !warnings.length;
   if (!warnings.length) closeWarnings();
   setText(button, `⚠ ${count(warnings.length, "warning")}`);
-  const groups = grouped(warnings), list = byId("warnings"), shown = JSON.stringify(groups);
+  const groups = grouped(warnings), list = byId("warnings"), canSeek = isDrive() && !state.status.live, shown = JSON.stringify([groups, canSeek]);
   if (list.dataset.shown === shown) return;
   list.dataset.shown = shown;
-  const canSeek = isDrive() && !state.status.live;
   list.replaceChildren(...groups.map(({ texts, at }) => el("li", { title: texts.length > 1 ? texts.join("\n") : "" }, texts.at(-1),
-    texts.length > 1 ? ` (${texts.length} times)` : "", at === undefined || !canSeek ? "" : " ", at === undefined || !canSeek ? "" : timeLink(at))));
+    texts.length > 1 ? ` (${texts.length} times)` : "", ...(at === undefined ? [] : [" ", canSeek ? timeLink(at) : `at ${clock(at)}`]))));
 }
 
 // Warnings that differ in numbers only are one, with all texts, and the time at which the newest text was given first.

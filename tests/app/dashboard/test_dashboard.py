@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
@@ -300,8 +301,14 @@ async def test_a_silence_of_a_robot_is_logged_with_the_time_of_its_last_scan(das
     silent = Status("waiting", "Nothing heard for 2 s: the robot is gone", live=True, scan_index=0)
     await dashboard.receive(Report(silent))
     told = browser_knows(dashboard)["events"]
-    assert told["events"][-1] == {"t": 0.0, "kind": "silence", "text": silent.detail, "for_s": None}
+    (last,) = told["events"][-1:]
+    assert last.pop("noted_s") == pytest.approx(time.time(), abs=60.0), "by the clock of this computer"
+    assert last == {"t": 0.0, "kind": "silence", "text": silent.detail, "for_s": None}
     assert told["start_s"] == pytest.approx(1e-9 * frame(0, 0).stamp_ns)
+    recording = replace(silent, recording="recording a.mcap, 2 MB", recorded_file="/a.mcap")
+    await dashboard.receive(Report(recording))
+    told = browser_knows(dashboard)["events"]["events"]
+    assert [each["text"] for each in told if each["kind"] == "recording"] == ["Recording: /a.mcap"]
 
 
 async def test_playing_a_dead_worker_plays_once_it_is_back(dashboard: Dashboard) -> None:

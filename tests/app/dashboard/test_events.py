@@ -67,7 +67,9 @@ def test_stops_silences_and_doubts_are_logged_with_their_durations():
     assert not events.silent("Nothing heard for 3 s: the robot is gone", 3.5)
     assert lasting(events)[-1] == (3.5, "silence", None)
     assert events.shown(seen(5, 0), 15.5)
-    assert lasting(events)[-2:] == [(1.0, "stop", 2.5), (3.5, "silence", 12.0)]
+    assert lasting(events)[-3:] == [(1.0, "stop", 2.5), (3.5, "slow", 0.0), (3.5, "silence", 12.0)]
+    assert (3.5, "slow", "Obstacle in the slow zone, 1.5 m ahead") in marks(events)
+    assert (15.5, "silence", "Data again") in marks(events)
     assert (1.0, "stop", "Obstacle in the stop zone, 0.8 m ahead") in marks(events)
     assert events.silent("gone again", 15.5)
 
@@ -94,6 +96,18 @@ def test_stops_and_doubts_end_at_a_silence_and_begin_again_after_it():
     events.silent("gone", 65.0)
     events.shown(seen(3, 0), 70.0)
     assert len(lasting(events)) == 6
+
+
+def test_a_recording_is_logged_and_outlasts_a_silence():
+    events = Events()
+    assert not events.recorded("", "", 0.0)
+    assert events.recorded("recording a.mcap, 0 MB", "/a.mcap", 1.0)
+    events.silent("Nothing heard for 2 s: the robot is gone", 3.0)
+    assert not events.recorded("finishing a.mcap", "/a.mcap", 4.0)
+    assert events.recorded("recorded a.mcap, 3 MB", "/a.mcap", 6.0)
+    assert lasting(events)[0] == (1.0, "recording", 5.0)
+    told = [(1.0, "recording", "Recording: /a.mcap"), (6.0, "recording", "Recorded a.mcap, 3 MB: /a.mcap")]
+    assert [mark for mark in marks(events) if mark[1] == "recording"] == told
 
 
 def test_a_log_of_a_live_run_outlasts_many_trees_and_a_rerun():
