@@ -124,6 +124,14 @@ SILENT = """async (for_s) => {
   return [way.hidden ? '' : way.innerText, way.dataset.zone, document.querySelector('#notice').hidden,
     ...['.map-frame canvas', '#scene'].map(part => getComputedStyle(document.querySelector(part)).filter)];
 }"""
+# No status of the server replaces the one that a test shows.
+STAYS = """async () => (await import('/static/js/core/live_feed.js')).receive('status', () => {})"""
+# One that has ended.
+ENDED_RUN = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.status = { ...state.status, state: 'finished' };
+  changed('status');
+}"""
 # One that waits for its first scan.
 UNHEARD = """async () => {
   const { state, changed } = await import('/static/js/core/store.js');
@@ -170,6 +178,7 @@ def test_a_notice_covers_no_button(dashboard: Dashboard):
 def test_a_silence_is_as_loud_as_a_stop_and_the_picture_looks_stale(dashboard: Dashboard):
     page = dashboard.page
     dashboard.stand(6.05)
+    page.evaluate(STAYS)
     why = "Robot forwarder-07 is gone; the map goes on when it is back"
     for for_s, zone in ((2, "slow"), (12, "silent")):
         text, shown, has_no_notice, *filters = page.evaluate(SILENT, for_s)
@@ -183,6 +192,7 @@ def test_a_silence_is_as_loud_as_a_stop_and_the_picture_looks_stale(dashboard: D
     page.evaluate(REAL_STATUS)
     expect(page.locator("#way")).to_be_hidden()
     dashboard.until("() => getComputedStyle(document.querySelector('#scene')).filter === 'none'")
+    page.reload()
 
 
 # The last status, as of a live run that has mapped something; later ones do not come in between.
@@ -302,11 +312,15 @@ def test_a_wrong_address_is_changed_from_its_message_and_the_wait_has_a_reason(d
 
 SIGNALS = """() => {
   window.signals = [];
+  window.tones = [];
   navigator.vibrate = (pattern) => { window.signals.push('vibration'); return true; };
   window.AudioContext = class {
     currentTime = 0;
     resume() { window.signals.push('sound'); }
-    createOscillator() { return { frequency: {}, connect() {}, start() {}, stop() {} }; }
+    createOscillator() {
+      const frequency = {};
+      return { frequency, connect() {}, start() { window.tones.push(frequency.value); }, stop() {} };
+    }
   };
 }"""
 
@@ -335,3 +349,25 @@ def test_sound_and_vibration_for_the_stop_zone_are_off_until_a_person_wants_them
     drive_to_the_person()
     dashboard.until("() => new Set(window.signals).size === 2")
     dashboard.pause()
+
+
+def test_a_silence_of_the_robot_has_a_signal_of_its_own(dashboard: Dashboard):
+    page = dashboard.page
+    page.evaluate(SIGNALS)
+    dashboard.stand(6.05)
+    page.locator("#keys-button").click()
+    box = page.get_by_label("Sound while")
+    box.uncheck()
+    box.check()
+    page.keyboard.press("Escape")
+    (known,) = set(page.evaluate("window.tones.splice(0)"))
+    page.evaluate(STAYS)
+    page.evaluate(SILENT, 12)
+    dashboard.until("() => window.tones.length >= 2")  # it repeats
+    (told,) = set(page.evaluate("window.tones.splice(0)"))
+    assert told != known, "not the signal of the stop zone"
+    is_silent = "async () => (await import('/static/js/shell/status.js')).isSilent()"
+    assert page.evaluate(is_silent)
+    page.evaluate(ENDED_RUN)
+    assert not page.evaluate(is_silent), "the run has ended"
+    page.reload()

@@ -1,33 +1,37 @@
-// Settings of this browser: theme, large controls, and sound and vibration while an obstacle is in the stop zone.
+// Settings of this browser: theme, large controls, and sound and vibration while an obstacle is in the stop zone or a robot sends no data.
 
 import { byId, recall, remember } from "../core/dom.js";
 import { isPlaying, on, state } from "../core/store.js";
 import { setTheme, themeName } from "../core/theme.js";
+import { isSilent } from "./status.js";
 
-const REPEAT = 1500; // [ms] between two signals while the zone stays
-const TONE = 880, TONE_MS = 180; // [Hz], [ms] of each of the two tones of a signal
-const PATTERN = [250, 120, 250]; // [ms] vibration, pause, vibration
-let audio = null, signalledAt = -REPEAT;
+const TICK = 500; // [ms] between two looks for a silence
+// A signal: frequency of its tones [Hz], duration of each and of the pause after it [ms], vibration and pauses [ms], and time
+// between two signals while the reason stays [ms].
+const STOP = { tone: 880, tone_ms: 180, tones: 2, vibration: [250, 120, 250], every: 1500 };
+const SILENCE = { tone: 330, tone_ms: 700, tones: 1, vibration: [900], every: 4000 };
+let audio = null, signalledAt = -Infinity;
 
 // A browser plays no sound before a person has clicked or pressed a key.
-function sound() {
+function sound({ tone: hertz, tone_ms: length, tones }) {
   audio ??= new AudioContext();
   audio.resume();
-  for (const delay of [0, 2 * TONE_MS]) {
-    const tone = audio.createOscillator(), start = audio.currentTime + delay / 1000;
-    tone.frequency.value = TONE;
+  for (let k = 0; k < tones; k += 1) {
+    const tone = audio.createOscillator(), start = audio.currentTime + (2 * k * length) / 1000;
+    tone.frequency.value = hertz;
     tone.connect(audio.destination);
     tone.start(start);
-    tone.stop(start + TONE_MS / 1000);
+    tone.stop(start + length / 1000);
   }
 }
 
-const SIGNALS = { "alarm-sound": sound, "alarm-vibration": () => navigator.vibrate?.(PATTERN) };
+const SIGNALS = { "alarm-sound": sound, "alarm-vibration": ({ vibration }) => navigator.vibrate?.(vibration) };
 
 function signal() {
-  if (state.map?.clearance?.zone !== "stop" || !isPlaying() || performance.now() - signalledAt < REPEAT) return;
+  const reason = isSilent() ? SILENCE : isPlaying() && state.map?.clearance?.zone === "stop" ? STOP : null;
+  if (!reason || performance.now() - signalledAt < reason.every) return;
   signalledAt = performance.now();
-  for (const [id, give] of Object.entries(SIGNALS)) if (byId(id).checked) give();
+  for (const [id, give] of Object.entries(SIGNALS)) if (byId(id).checked) give(reason);
 }
 
 function startBox(id, isOn, act) {
@@ -60,10 +64,11 @@ export function startSettings() {
   for (const [id, give] of Object.entries(SIGNALS)) {
     startBox(id, recall(id) === "on", (wanted) => {
       remember(id, wanted ? "on" : "off");
-      if (wanted) give(); // so that a person knows it
+      if (wanted) give(STOP); // so that a person knows it
     });
   }
   on("status", showStorage);
   byId("alarm-vibration").parentElement.hidden = !navigator.vibrate;
   on("map", signal);
+  setInterval(signal, TICK); // in a silence nothing comes
 }

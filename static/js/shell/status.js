@@ -88,6 +88,12 @@ function silenceOf(s) {
   if (!NO_DATA.test(s.health)) return null;
   return { what: "No data", for_s: Math.floor(ageOf(s) ?? 0), why: capital(s.detail.replace(/^Nothing heard for \d+ s: /, "")) };
 }
+// Whether the line below the strip reports a silence as loudly as a stop.
+const isLoud = (silence) => silence.for_s > OLD_AFTER / 1000;
+export const isSilent = () => {
+  const silence = silenceOf(state.status);
+  return silence !== null && isLoud(silence);
+};
 let held = { state: "good", reason: "", source: "", at: -Infinity };
 
 function health({ health: word, state: phase, source }) {
@@ -239,7 +245,7 @@ function showWay() {
   const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld();
   const text = silence ? `■ ${silence.what}` : clearance && !quiet && WAY[clearance.zone];
   way.hidden = !text;
-  way.dataset.zone = silence ? (silence.for_s > OLD_AFTER / 1000 ? "silent" : "slow") : clearance?.zone ?? "";
+  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : clearance?.zone ?? "";
   showObstacle(text && !silence && state.map.obstacle ? { ...state.map.obstacle, zone: clearance.zone } : null);
   const [zone, distance, why] = way.children;
   if (text) setText(zone, text);
