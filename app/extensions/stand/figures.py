@@ -201,7 +201,11 @@ def stand_figures(
     elif n < FEW_TREES:
         warnings.append(f"only {n} {'tree' if n == 1 else 'trees'}: the figures are uncertain")
     if missing:
-        warnings.append(f"{missing} of {n} trees have no diameter; they count with the mean basal area")
+        warnings.append(
+            f"{missing} of {n} trees have no diameter: they count with the mean basal area of the others, "
+            "and figures of diameters are those of the others; both are wrong if the others are thinner or "
+            "thicker"
+        )
     heights = 0 if kept.height is None else int(np.count_nonzero(np.isfinite(kept.height)))
     volumes = None if kept.volume is None else int(np.count_nonzero(np.isfinite(kept.volume)))
     if volumes is not None and volumes < n:
@@ -355,8 +359,8 @@ def _variance_of_sum(sigma: Float, shared: Float) -> float:
 def _basal_areas(trees: PlotTrees, common: float) -> tuple[Float, float]:
     """Return the basal area of each tree, shape (T,) [m^2], and the variance of their sum [m^4], with the
     error `common` of all diameters [m]. A tree without a diameter has the mean, with the variance among the
-    others (of a single one its square); both are NaN if no tree has a diameter. An unknown standard deviation
-    of a diameter counts as 0."""
+    others (of a single one its square) and that of their mean, which is one error of all such trees. Both are
+    NaN if no tree has a diameter. An unknown standard deviation of a diameter counts as 0."""
     d, sigma = trees.dbh, np.nan_to_num(trees.dbh_sigma)
     known = np.isfinite(d)
     if not len(d):
@@ -370,7 +374,8 @@ def _basal_areas(trees: PlotTrees, common: float) -> tuple[Float, float]:
     spread = float(basal[known].var(ddof=1)) if known.sum() > 1 else mean**2
     # The mean that a tree without a diameter has contains the shared error, too.
     of_all = np.where(known, shared, float(shared[known].mean()))
-    own = float((np.square(error) - np.square(shared))[known].sum()) + missing * spread
+    own = float((np.square(error) - np.square(shared))[known].sum())
+    own += spread * (missing + missing**2 / int(known.sum()))
     return np.where(known, basal, mean), own + float(of_all.sum()) ** 2
 
 
@@ -413,14 +418,17 @@ def _threshold_variance(trees: PlotTrees, least: float, common: float) -> float:
 
 def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: Stand) -> dict[str, Estimate]:
     """Return a dict from "dg_cm", "mean_dbh_cm", "dominant_dbh_cm" and "sdi" to estimates; empty if no tree
-    has a diameter. The standard errors contain the jackknife over trees, reduced by the share `found` of all
-    trees, and the errors of the diameters. `seen` is the observed area [m^2]."""
+    has a diameter. The trees with a diameter stand for all: the thickest per hectare are the same share of
+    them. The standard errors contain the jackknife over them, reduced by their share of all trees, of which
+    the share `found` was found and observed, and the errors of the diameters. `seen` is the observed area
+    [m^2]."""
     known = np.isfinite(trees.dbh)
     d, sigma = 100.0 * trees.dbh[known], 100.0 * np.nan_to_num(trees.dbh_sigma[known])
     if not len(d):
         return {}
+    measured = len(d) / len(trees.dbh)
     shared = 100.0 * trees.shared(parameters.dbh_shared_sigma)[known]
-    thickest = min(parameters.dominant_per_ha * seen / HECTARE, float(len(d)))
+    thickest = min(measured * parameters.dominant_per_ha * seen / HECTARE, float(len(d)))
     stems = HECTARE * len(trees.dbh) / seen
 
     def dominant(values: Float) -> tuple[float, Float]:
@@ -444,7 +452,7 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
         return figure, REINEKE * figure / dg * slope
 
     figures = {"dg_cm": quadratic, "mean_dbh_cm": mean, "dominant_dbh_cm": dominant, "sdi": density}
-    return {name: _with_error(figure, d, sigma, shared, found) for name, figure in figures.items()}
+    return {name: _with_error(figure, d, sigma, shared, measured * found) for name, figure in figures.items()}
 
 
 def _with_error(
@@ -457,7 +465,7 @@ def _with_error(
             derivatives with respect to the diameters, shape (N,).
         d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
         shared: Part of `sigma` that is one error of all diameters, shape (N,) [cm].
-        found: Share of all trees that was found and observed.
+        found: Share of all trees that was found, observed and measured.
     """
     n = len(d)
     value, slope = figure(d)

@@ -19,6 +19,7 @@ from app.common.text import count, version
 from app.extensions.stand.figures import (
     FEW_TREES,
     FIGURES,
+    HECTARE,
     Estimate,
     PlotTrees,
     StandFigures,
@@ -279,7 +280,8 @@ def stand_files(result: StandResult) -> dict[str, str]:
     """Return a dict from the names of three files to their texts. stand.csv has the columns PLOT_COLUMNS,
     then each stand parameter of FIGURES and its standard error with "_se", one row per plot, and for several
     plots a row `mean` with only stand parameters. classes.csv has the columns CLASS_COLUMNS, one row per plot
-    and class. stand.json is `stand_record`. Unknown values are empty cells or null."""
+    and class, then one without limits for its trees without a diameter, if there are any. stand.json is
+    `stand_record`. Unknown values are empty cells or null."""
     header = (*PLOT_COLUMNS, *(f"{name}{end}" for name in FIGURES for end in ("", "_se")))
     rows = []
     for name, f in result.figures.items():
@@ -290,11 +292,15 @@ def stand_files(result: StandResult) -> dict[str, str]:
         rows.append([*about, *_numbers(f.detection), *_cells(dict(f.values))])
     if len(result.figures) > 1:
         rows.append(["mean", *[""] * (len(PLOT_COLUMNS) - 1), *_cells(result.total)])
-    classes = [
-        [name, f"{c.low:g}", f"{c.high:g}", str(c.trees), *_numbers((*c.n_ha, *c.g_ha))]
-        for name, f in result.figures.items()
-        for c in f.classes
-    ]
+    classes = []
+    for name, f in result.figures.items():
+        classes += [
+            [name, f"{c.low:g}", f"{c.high:g}", str(c.trees), *_numbers((*c.n_ha, *c.g_ha))]
+            for c in f.classes
+        ]
+        if f.without_dbh:
+            per_ha = Estimate(HECTARE * f.without_dbh / f.seen)
+            classes.append([name, "", "", str(f.without_dbh), *_numbers((*per_ha, *Estimate()))])
     return {
         "stand.csv": csv_text(header, rows),
         "classes.csv": csv_text(CLASS_COLUMNS, classes),

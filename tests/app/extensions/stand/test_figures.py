@@ -414,3 +414,29 @@ def test_an_error_of_0_is_not_known_while_detection_is_assumed():
     assert half.values["n_ha"] == figures(trees, seen=500.0).values["n_ha"]
     unsure = figures(trees_of([0.2] * 20, [0.01] * 20), detection=(1.0, math.nan))
     assert unsure.values["g_ha"].se > 0.0
+
+
+def test_trees_without_a_diameter_are_drawn_from_the_others():
+    """Stands of which two fifths are measured: errors of the basal area and of the figures of diameters."""
+    random = np.random.default_rng(8)
+    names, errors, told = ("g_ha", "dg_cm", "mean_dbh_cm"), [], []
+    for _ in range(400):
+        d = random.lognormal(math.log(0.3), 0.3, 50)
+        known = np.where(random.random(50) < 0.4, d, np.nan)
+        v, whole = (figures(trees_of(each), limits=INDEPENDENT).values for each in (known, d))
+        errors.append([v[name].value - whole[name].value for name in names])
+        told.append([v[name].se for name in names])
+    ratio = np.std(errors, axis=0) / np.sqrt(np.square(told).mean(axis=0))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.12)
+
+
+def test_the_thickest_trees_are_those_of_all_of_which_some_are_measured():
+    random, errors = np.random.default_rng(9), []
+    for _ in range(200):
+        d = random.lognormal(math.log(0.3), 0.3, 80)
+        known = np.where(random.random(80) < 0.5, d, np.nan)
+        of_part, of_all = (
+            figures(trees_of(each), area=1000.0).values["dominant_dbh_cm"].value for each in (known, d)
+        )
+        errors.append(of_part - of_all)
+    assert np.mean(errors) == pytest.approx(0.0, abs=1.0)  # 10 of 80 trees, so 5 of 40
