@@ -19,7 +19,7 @@ RANGE = 30.0  # m; views from farther away are not recorded
 INTO = 0.5
 # A scan is recorded after this motion [m, rad].
 SPACING, TURN = 0.5, math.radians(10.0)
-# Gaps up to this width [m] count as observed, such as the shadow of a stem or the undergrowth around it.
+# Gaps up to this width [m] count as observed, such as the shadow of a stem.
 GAP = 1.0
 # Rows of views that are grouped at once: their arrays take about 100 MB, while a view has 11,000 rows.
 ROWS_MOST = 1_000_000
