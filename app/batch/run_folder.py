@@ -334,7 +334,9 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
     except (csv.Error, ValueError):
         raise damaged from None
     if not rows or not set(names) <= set(rows[0]):
-        raise SourceError(f"the columns are not {', '.join(names)}", where=str(file))
+        raise SourceError(
+            f"the columns are not {', '.join(names)}", where=str(file), remedy="Map the run again"
+        )
     order = [rows[0].index(name) for name in names]
     try:
         if any(len(row) != len(rows[0]) for row in rows):

@@ -187,7 +187,7 @@ def test_what_is_not_known_of_detection_is_said_and_no_error_is_0(run, tmp_path,
     many = stemmap(capsys, "stand", run).out
     assert "Stems per hectare: 2,500 1/ha, standard error not known" in many
     assert "detection: does not decrease with distance within reach" in many
-    assert "trees that neither the map nor people have are not included" in many
+    assert "false trees, and trees that neither the map nor people have, are not included" in many
     position = np.random.default_rng(2).uniform(1, 19, (12, 2))
     few = stemmap(capsys, "stand", write_run(tmp_path / "few", position, np.full(12, 0.2)), "--out", tmp_path)
     assert "detection: not estimated from fewer than 20 trees, every tree in view counts as found" in few.out
