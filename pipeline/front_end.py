@@ -206,7 +206,7 @@ def _segment_points(
 
     with timer("free view"):
         free = clear_range(raw, filtered, sensor_offset)
-        view = _seen_range(boxed, height, terrain, sensor_offset, p.ground, free)
+        in_view = _seen_range(boxed, height, seen, sensor_offset, p.ground, free)
 
     with timer("obstacles"):
         near = acquire_near(step, T_base_lidar, p.acquisition)
@@ -220,7 +220,7 @@ def _segment_points(
         clusters=described,
         heights=None if seen is None else heights_of_places(described.centroid, seen.height),
         free=free,
-        seen=view,
+        seen=in_view,
         sensor_offset=sensor_offset,
         column_input=_column_input(raw, boxed, height, seen, sensor_offset, sensor)
         if p.classification.method == "columns" and step.is_due(interval)
@@ -255,8 +255,10 @@ def _seen_range(
     parameters: Ground,
     free: Float,
 ) -> Float:
-    """Return the `seen_range` of the points in the box with their heights; without heights, which no band
-    limits then, the farthest points end it."""
+    """Return the `seen_range` of the points in the box with their heights. Without a ground model, no band
+    limits it: it ends at the farthest points. It is `free` if no ground is in view."""
+    if height is not None and terrain is None:
+        return free
     if height is None or terrain is None:
         everything = np.zeros(len(boxed), np.float32)
         return seen_range(boxed, everything, sensor_offset, 0.0, (-math.inf, math.inf), free)

@@ -108,8 +108,8 @@ def _updated(before: Fault, kind: str, reason: str, stamp_ns: int, start_ns: int
 
 
 def fault_of_short_run(scans: int, groundless: int, *, is_empty: bool) -> str:
-    """Return a message if most scans of a run do not show the ground; "" otherwise. A run that is shorter
-    than a fault that lasts has no other message about it.
+    """Return a message if most scans of a run do not show the ground, or no return is in range; "" otherwise.
+    A run that is shorter than a fault that lasts has no other message about it.
 
     Args:
         scans, groundless: Number of scans, and of those that do not show the ground.

@@ -65,9 +65,13 @@ class SeenArea:
         """Return the area with the rows for which `keep`, shape (K,), is true."""
         return SeenArea(self.cell, self.place[keep], self.nearest[keep], self.views[keep], self.clear[keep])
 
+    def clear_cells(self) -> SeenArea:
+        """Return the cells that show that a tree is absent: clear ones, and all of unknown views."""
+        return self.where(self.clear | (self.views == 0))
+
     def closed(self) -> SeenArea:
-        """Return the area with gaps up to GAP closed: stems and the undergrowth around them hide ground. A
-        cell of a gap has the distance and the views of the nearest cell, and is not clear."""
+        """Return the area with gaps up to GAP closed: stems hide the cells behind them. A cell of a gap has
+        the distance and the views of the nearest cell, and is not clear."""
         from scipy.ndimage import binary_closing, distance_transform_edt
 
         if not len(self.place):
@@ -204,8 +208,8 @@ class SeenRecorder:
 
     def area(self, path: Path) -> SeenArea:
         """Return the observed area: a scan observes the cells whose centres are at most RANGE away and at
-        most INTO behind the end of the range up to which stems are in view. Those at most INTO behind the
-        end of the free range are clear. Without scans it has no cells.
+        most INTO behind the end of the range up to which stems are in view. Those within the free
+        range are clear. Without scans it has no cells.
 
         Args:
             path: Final path; recorded scans whose stamps it does not have are left out.
@@ -233,7 +237,7 @@ class SeenRecorder:
             seen = (reach <= in_view[bins] + INTO) & (reach <= RANGE)
             cells.append(place[seen])
             distance.append(reach[seen])
-            clear.append((reach <= free[bins] + INTO)[seen])
+            clear.append((reach <= free[bins])[seen])
             rows += len(cells[-1])
             if rows >= max(ROWS_MOST, len(area.place)):  # each time the whole area is sorted
                 area = _with_views(area, cells, distance, clear)

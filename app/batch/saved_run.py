@@ -23,7 +23,7 @@ from pipeline.odometry.synchroniser import OdometryChoice, steps
 from pipeline.types.records import Step, Truth
 
 STATE = "state.zip"
-FORMAT = 9
+FORMAT = 10
 LARGEST_FILE = 4 << 30
 
 

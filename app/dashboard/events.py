@@ -110,13 +110,14 @@ class Events:
             text = f"SLAM {health.state}: {health.reason}" if health.reason else f"SLAM {health.state}"
             self._note(f"health {frame.index}", Event(time_s, "health", text, health.state != "good"))
         ahead = frame.clearance
-        kinds: tuple[tuple[Kind, Zone], ...] = (("stop", Zone.STOP), ("slow", Zone.SLOW))
-        for kind, zone in kinds:
-            text = f"obstacle in the {kind} zone"
-            if ahead is not None and ahead.zone == zone:
-                self._turn(kind, True, time_s, f"{text.capitalize()}, {ahead.ahead:.1f} m ahead")
-            else:
-                self._turn(kind, False, time_s, f"No {text}")
+        if ahead is not None and ahead.zone != Zone.UNKNOWN:  # else nothing is known of the zones
+            told = f"Obstacle in the {ahead.zone.label} zone, {ahead.ahead:.1f} m ahead"
+            is_stop = ahead.zone == Zone.STOP
+            self._turn("stop", is_stop, time_s, told if is_stop else "No obstacle in the stop zone")
+            if ahead.zone == Zone.SLOW:
+                self._turn("slow", True, time_s, told)
+            elif ahead.zone == Zone.CLEAR:  # an obstacle in the stop zone is in the slow zone as well
+                self._turn("slow", False, time_s, "No obstacle in the slow zone")
         self._turn("silence", False, time_s, "Data again")
 
     def silent(self, why: str, time_s: float) -> bool:
@@ -136,15 +137,20 @@ class Events:
         return True
 
     def recorded(self, recording: str, file: str, time_s: float) -> bool:
-        """Add an event when the recording of a robot begins or ends; return whether it was added.
+        """Add an event when the recording of a robot begins, ends or is refused; return whether it was added.
 
         Args:
             recording, file: `recording` and `recorded_file` of the status.
             time_s: Time of the last scan [s since the first scan].
         """
         is_on = recording.startswith(("recording", "finishing"))
-        text = "Recording" if is_on else f"{recording[:1].upper()}{recording[1:]}"
-        return self._turn("recording", is_on, time_s, f"{text}: {file}"[:_LONGEST])
+        words = "Recording" if is_on else f"{recording[:1].upper()}{recording[1:]}" or "Recording ended"
+        text = ": ".join(part for part in (words, file) if part)[:_LONGEST]
+        key = f"recording {recording}"
+        if not recording.startswith("not") or "recording" in self._lasting or key in self._events:
+            return self._turn("recording", is_on, time_s, text)
+        self._note(key, Event(time_s, "recording", text))
+        return True
 
     def remapped(self, confirmed: list[tuple[int, float]], time_s: float, *, live: bool = False) -> None:
         """Replace the events of trees by those of `confirmed`, and remove those of the pose quality, after
@@ -275,4 +281,4 @@ class Events:
 def _goes(kind: Kind) -> int:
     """Return the place of a kind in the order in which events are removed: what an operator is asked for
     afterwards goes last."""
-    return {"tree": 0, "slow": 1, "warning": 2, "change": 2, "annotation": 2}.get(kind, 3)
+    return {"slow": 0, "tree": 1, "warning": 2, "change": 2, "annotation": 2}.get(kind, 3)

@@ -86,12 +86,12 @@ def seen_range(
     low, high = band
     seen = free.copy()
     for i in range(points.shape[0]):
-        part = 1.0  # of the ray, up to where it leaves the band
+        part = 1.0  # of the ray, up to where it leaves the band; 0 if it is never in it
         if height[i] > high:
-            part = (high - sensor_height) / (height[i] - sensor_height)
+            part = (high - sensor_height) / (height[i] - sensor_height) if sensor_height < high else 0.0
         elif height[i] < low:
-            part = (sensor_height - low) / (sensor_height - height[i])
-        if part > 0.0:  # else the ray is outside of the band from the sensor on
+            part = (sensor_height - low) / (sensor_height - height[i]) if sensor_height > low else 0.0
+        if part > 0.0:
             x, y = part * points[i, 0] + sensor_offset[0], part * points[i, 1] + sensor_offset[1]
             k = direction_bin(x, y, BINS)
             seen[k] = max(seen[k], np.sqrt(x * x + y * y))

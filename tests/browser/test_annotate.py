@@ -794,7 +794,7 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     field.press("Enter")
     mapped = f"{first['dbh_cm']:.1f} ± {first['sigma_dbh_cm']:.1f}"
     expect(last.locator("span")).to_have_text(
-        f"Tree {first['number']}: tree, 2.6 cm; the map has {mapped} cm. In cm?"
+        f"Tree {first['number']}: tree, 2.6 cm; the map has {mapped} cm. Was it typed in cm?"
     )
     page.evaluate(select, second["number"])
     person.answer("d")

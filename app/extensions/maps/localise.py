@@ -217,7 +217,8 @@ def _observed(seen: SeenArea | None, points: Float) -> Bool:
     """Return whether an area contains each position near enough to be observed, shape (N,)."""
     if seen is None or not len(points):
         return np.zeros(len(points), np.bool_)
-    observed: Bool = seen.where(~(seen.nearest > SEEN_REACH)).rows(points) >= 0
+    clear = seen.clear_cells()
+    observed: Bool = clear.where(~(clear.nearest > SEEN_REACH)).rows(points) >= 0
     return observed
 
 

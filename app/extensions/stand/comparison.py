@@ -129,7 +129,7 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
     if path.is_dir():
         run, recorded = read_run(path), read_seen_area(path)
         trees = run.trees
-        seen = None if recorded is None else within_reach(recorded, Stand())
+        seen = None if recorded is None else within_reach(recorded.clear_cells(), Stand())
         sigma = np.sqrt(0.5 * np.trace(trees.covariance, axis1=1, axis2=2))
         found = VisitTrees(trees.number, trees.position, sigma, trees.dbh, trees.dbh_sigma)
         visit = Visit(str(path), found, run.rejected.position, seen, read_map_frame(path))

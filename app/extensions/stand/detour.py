@@ -1,10 +1,11 @@
 """The way that shows trees without a diameter from the sides that were never seen.
 
 A diameter needs views of a stem from an arc of `tracking.dbh_arc_min`. The places that would add the missing
-part are known from the sectors that were seen (`Trees.sides`); the way visits them through the observed area,
-clear of the trees. The shortest way that visits one place of each of several sets is a generalised travelling
-salesman problem; here the place with the largest ratio of gain to distance is always the next one, where each
-tree gains the share of its missing sectors that the place shows (the greedy set cover of Chvatal, 1979).
+part are known from the sectors that were seen (`Trees.sides`); the way visits them through the cells of the
+observed area without undergrowth, clear of the trees. The shortest way that visits one place of each of
+several sets is a generalised travelling salesman problem; here the place with the largest ratio of gain to
+distance is always the next one, where each tree gains the share of its missing sectors that the place shows
+(the greedy set cover of Chvatal, 1979).
 """
 
 from __future__ import annotations

@@ -200,7 +200,9 @@ def stand_figures(
         warnings.append("the plot has no trees")
     elif n < FEW_TREES:
         warnings.append(f"only {n} {'tree' if n == 1 else 'trees'}: the figures are uncertain")
-    if missing:
+    if 0 < n == missing:
+        warnings.append("no tree has a diameter: basal area and figures of diameters are not known")
+    elif missing:
         warnings.append(
             f"{missing} of {n} trees have no diameter: they count with the mean basal area of the others, "
             "and figures of diameters are those of the others; both are wrong if the others are thinner or "

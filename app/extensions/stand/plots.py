@@ -185,8 +185,8 @@ def seen_plot(name: str, seen: SeenArea) -> SamplePlot:
 
 def within_reach(seen: SeenArea, parameters: Stand) -> SeenArea:
     """Return the cells that count as observed: nearest view at most `reach` away, and at least `views_min`
-    views, with gaps closed (`SeenArea.closed`), since the cells that stems and their undergrowth hide are
-    those of trees. An unknown distance (NaN) or number of views (0), as for a whole cloud, excludes no cell.
+    views, with gaps closed (`SeenArea.closed`), since stems hide the cells behind them. An unknown distance
+    (NaN) or number of views (0), as for a whole cloud, excludes no cell.
     """
     near = ~(seen.nearest > parameters.reach)
     return seen.where(near & ((seen.views >= parameters.views_min) | (seen.views == 0))).closed()

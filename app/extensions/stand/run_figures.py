@@ -426,9 +426,8 @@ def stand_summary(result: StandResult) -> list[str]:
         lines.append(f"detection: {_NO_DECREASE[detection.reason]}")
     corrected = "; corrected figures also detection" if math.isfinite(detection.sigma) else ""
     errors = "between plots" if len(observed) > 1 else f"of this area: diameters, occlusion{corrected}"
-    lines.append(
-        f"+- standard error {errors}; false trees, and trees that neither the map nor people have, are not included"
-    )
+    without = "false trees, and trees that neither the map nor people have, are not included"
+    lines.append(f"+- standard error {errors}; {without}")
     return lines
 
 

@@ -484,7 +484,7 @@ export function answerText() {
 function dbhDoubt({ dbh, mapped, sigma }) {
   if ([dbh, mapped, sigma].includes(null)) return "";
   const isNear = Math.abs(dbh - mapped) <= MOST_SIGMAS * Math.hypot(sigma, state.annotations?.tape_sigma_cm ?? 0);
-  return isNear ? "" : `; the map has ${dbhFigure(mapped, sigma)} cm. In cm?`;
+  return isNear ? "" : `; the map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
 }
 
 // --- the chosen annotation -------------------------------------------------------------------------------------

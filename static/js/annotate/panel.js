@@ -85,7 +85,7 @@ function nameField(id) {
   return field;
 }
 
-// A link to the annotations; the file is named after the run at the time of the click. The server sends another name, which would count.
+// A link to the annotations; the file is named after the run at the time of the click. The name that the server sends would be used otherwise.
 function truthLink(suffix, format) {
   const address = `/api/annotations.${suffix}`;
   return el("a", { class: "small", href: address, text: `Save ${format}`, title: `Download the annotations as ${format}, with the tree numbers of the shown scan`, onclick: (event) => {

@@ -160,7 +160,7 @@ function showNextToReview() {
 
 let mapped = ""; // source of the map that is shown
 
-// The part that a person chose was one of the run before.
+// What a person chose to see was a part of the run before.
 function fitToRun({ status }) {
   const before = mapped;
   mapped = status?.source ?? before;

@@ -28,7 +28,7 @@ function sound({ tone: hertz, tone_ms: length, tones }) {
 const SIGNALS = { "alarm-sound": sound, "alarm-vibration": ({ vibration }) => navigator.vibrate?.(vibration) };
 
 function signal() {
-  const reason = isSilent() ? SILENCE : isPlaying() && state.map?.clearance?.zone === "stop" ? STOP : null;
+  const reason = isSilent() ? SILENCE : isPlaying() && state.obstacle?.zone === "stop" ? STOP : null;
   if (!reason || performance.now() - signalledAt < reason.every) return;
   signalledAt = performance.now();
   for (const [id, give] of Object.entries(SIGNALS)) if (byId(id).checked) give(reason);
@@ -70,5 +70,5 @@ export function startSettings() {
   on("status", showStorage);
   byId("alarm-vibration").parentElement.hidden = !navigator.vibrate;
   on("map", signal);
-  setInterval(signal, TICK); // in a silence nothing comes
+  setInterval(signal, TICK); // without data, no map comes
 }

@@ -242,7 +242,8 @@ const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "
 function showWay() {
   const clearance = state.map?.clearance, silence = silenceOf(state.status);
   // Only a robot that drives on has something in its way, and only a scan of now shows it.
-  const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld();
+  const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld()
+    || (state.status?.live && state.status.state === "paused"); // the robot drives on
   const text = silence ? `■ ${silence.what}` : clearance && !quiet && WAY[clearance.zone];
   way.hidden = !text;
   way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : clearance?.zone ?? "";

@@ -85,7 +85,7 @@ def test_stops_and_doubts_end_at_a_silence_and_begin_again_after_it():
     assert not events.silent("Nothing heard for 9 s: the robot is gone", 3.0)
     assert lasting(events) == silent
     events.shown(replace(stopped, index=1), 60.0)
-    events.shown(seen(2, 0), 64.0)
+    events.shown(replace(seen(2, 0), clearance=Clearance(Zone.CLEAR)), 64.0)
     assert lasting(events) == [
         (1.0, "health", 2.0),
         (1.0, "stop", 2.0),
@@ -108,6 +108,26 @@ def test_a_recording_is_logged_and_outlasts_a_silence():
     assert lasting(events)[0] == (1.0, "recording", 5.0)
     told = [(1.0, "recording", "Recording: /a.mcap"), (6.0, "recording", "Recorded a.mcap, 3 MB: /a.mcap")]
     assert [mark for mark in marks(events) if mark[1] == "recording"] == told
+
+
+def test_a_recording_that_cannot_begin_is_logged_once():
+    events = Events()
+    assert events.recorded("not recording: no space is left", "", 1.0)
+    assert not events.recorded("not recording: no space is left", "", 1.5)
+    assert marks(events) == [(1.0, "recording", "Not recording: no space is left")]
+
+
+def test_from_the_slow_to_the_stop_zone_no_obstacle_goes():
+    events = Events()
+    for k, zone in enumerate([Zone.SLOW, Zone.STOP, Zone.UNKNOWN, None, Zone.STOP, Zone.SLOW, Zone.CLEAR]):
+        ahead = None if zone is None else Clearance(zone, ahead=1.0)
+        events.shown(replace(seen(k, 0), clearance=ahead), 0.1 * k)
+    assert [(round(10 * at), text.partition(",")[0]) for at, _, text in marks(events)] == [
+        (0, "Obstacle in the slow zone"),
+        (1, "Obstacle in the stop zone"),
+        (5, "No obstacle in the stop zone"),
+        (6, "No obstacle in the slow zone"),
+    ]
 
 
 def test_a_log_of_a_live_run_outlasts_many_trees_and_a_rerun():

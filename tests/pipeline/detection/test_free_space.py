@@ -180,3 +180,12 @@ def test_the_seen_range_is_that_of_points_along_all_rays(seed):
     apart = np.flatnonzero(~np.isclose(got, wanted, atol=0.02))
     assert len(apart) <= 2, "only a ray at the border of two directions"
     assert (got >= free).all()
+
+
+@pytest.mark.parametrize(
+    ("sensor_height", "band", "height"),
+    [(0.25, (0.3, 3.0), 0.28), (0.25, (0.3, 3.0), 0.25), (1.8, (1.2, 1.4), 1.6), (0.0, (0.3, 3.0), 0.1)],
+)
+def test_a_ray_that_stays_outside_of_the_band_shows_nothing(sensor_height, band, height):
+    point, none = np.array([[5.0, 0.0, height - sensor_height]], np.float32), np.zeros(BINS)
+    assert not seen_range(point, np.array([height], np.float32), np.zeros(3), sensor_height, band, none).any()

@@ -117,7 +117,7 @@ def test_a_scan_observes_up_to_its_free_range_and_not_behind_a_stem():
     assert len(seen.place) * CELL**2 == pytest.approx(expected, rel=0.02)
     np.testing.assert_allclose(seen.nearest, np.hypot(*seen.centres.T))
     assert (seen.views == 1).all()
-    np.testing.assert_array_equal(seen.clear, seen.nearest <= 6.5)
+    np.testing.assert_array_equal(seen.clear, seen.nearest <= 6.0)
 
 
 def test_the_observed_area_moves_with_the_final_path():
