@@ -417,17 +417,26 @@ def test_an_error_of_0_is_not_known_while_detection_is_assumed():
 
 
 def test_trees_without_a_diameter_are_drawn_from_the_others():
-    """Stands of which two fifths are measured: errors of the basal area and of the figures of diameters."""
+    """Stands of which 8 of 50 trees are not measured: errors of the basal area and of mean diameters."""
     random = np.random.default_rng(8)
     names, errors, told = ("g_ha", "dg_cm", "mean_dbh_cm"), [], []
     for _ in range(400):
         d = random.lognormal(math.log(0.3), 0.3, 50)
-        known = np.where(random.random(50) < 0.4, d, np.nan)
+        known = np.where(random.permutation(50) < 42, d, np.nan)
         v, whole = (figures(trees_of(each), limits=INDEPENDENT).values for each in (known, d))
         errors.append([v[name].value - whole[name].value for name in names])
         told.append([v[name].se for name in names])
     ratio = np.std(errors, axis=0) / np.sqrt(np.square(told).mean(axis=0))
     np.testing.assert_allclose(ratio, 1.0, atol=0.12)
+
+
+def test_errors_are_not_known_where_many_trees_have_no_diameter():
+    d = np.full(50, 0.3)
+    for missing, is_known in ((10, True), (11, False)):
+        f = figures(trees_of(np.where(np.arange(50) < missing, np.nan, d), 0.01))
+        assert np.isfinite([f.values[name].se for name in ("g_ha", "dg_cm", "sdi")]).all() == is_known
+        assert any("more than a fifth" in text for text in f.warnings) != is_known
+        assert f.values["g_ha"].value == pytest.approx(50 * 10.0 * math.pi / 4 * 0.09)
 
 
 def test_the_thickest_trees_are_those_of_all_of_which_some_are_measured():
