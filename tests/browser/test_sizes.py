@@ -118,13 +118,13 @@ def test_the_strip_of_a_live_run_is_whole_and_nothing_in_it_moves(mapped: Dashbo
             assert spills == [], width
             assert overlaps == [], width
             places.append(place)
+            assert name == ["192.168.100.200:7447", False], width
         assert places[0] == places[1], width
         if width == 1440:
             shown = {name for name, _ in places[1][1:]}
             assert shown == {"trees", "health", "data", "driven", "behind", "mapping", "rate", "sigma"}
             assert words == ["0.2s old", "link: 123 lost\nmapping: 1234 left out", "Live forwarder-07"]
         assert "data" in {name for name, _ in places[1][1:]}, width
-        assert name == ["192.168.100.200:7447", False], width
         if width < 400:
             assert places[1][0] < 0.15 * height
 
