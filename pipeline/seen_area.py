@@ -190,8 +190,8 @@ class ViewSelection:
 
 
 class SeenRecorder:
-    """Collects the views of scans along a drive. Poses are applied at the end, so that corrections of
-    the path also move what was observed."""
+    """Collects the views of scans along a drive. Poses are applied at the end, so that corrections of the
+    path also move what was observed."""
 
     def __init__(self) -> None:
         self._views: dict[int, Float32] = {}
@@ -208,8 +208,8 @@ class SeenRecorder:
 
     def area(self, path: Path) -> SeenArea:
         """Return the observed area: a scan observes the cells whose centres are at most RANGE away and at
-        most INTO behind the end of the range up to which stems are in view. Those within the free
-        range are clear. Without scans it has no cells.
+        most INTO behind the end of the range up to which stems are in view. Those within the free range are
+        clear. Without scans it has no cells.
 
         Args:
             path: Final path; recorded scans whose stamps it does not have are left out.

@@ -47,8 +47,8 @@ class Event:
 
 
 class Events:
-    """Events of a run, at most 400. Beyond them the oldest trees are removed first, then obstacles in the
-    slow zone, then warnings and edits, and stops, silences, recordings and the pose quality last.
+    """Events of a run, at most 400. Beyond them the oldest obstacles in the slow zone are removed first, then
+    trees, then warnings and edits, and stops, silences, recordings and the pose quality last.
 
     After a change of parameters, events later than the current scan remain, flagged as from before the
     change, until the run reaches them again.
@@ -111,11 +111,11 @@ class Events:
             self._note(f"health {frame.index}", Event(time_s, "health", text, health.state != "good"))
         ahead = frame.clearance
         if ahead is not None and ahead.zone != Zone.UNKNOWN:  # else nothing is known of the zones
-            told = f"Obstacle in the {ahead.zone.label} zone, {ahead.ahead:.1f} m ahead"
+            text = f"Obstacle in the {ahead.zone.label} zone, {ahead.ahead:.1f} m ahead"
             is_stop = ahead.zone == Zone.STOP
-            self._turn("stop", is_stop, time_s, told if is_stop else "No obstacle in the stop zone")
+            self._turn("stop", is_stop, time_s, text if is_stop else "No obstacle in the stop zone")
             if ahead.zone == Zone.SLOW:
-                self._turn("slow", True, time_s, told)
+                self._turn("slow", True, time_s, text)
             elif ahead.zone == Zone.CLEAR:  # an obstacle in the stop zone is in the slow zone as well
                 self._turn("slow", False, time_s, "No obstacle in the slow zone")
         self._turn("silence", False, time_s, "Data again")
