@@ -165,6 +165,18 @@ class Dashboard:
         self.until_server("/api/status", f"it.state === 'paused' && it.remapped === null && {there}")
         self.until_shown()
 
+    def go_to(self, time_s: float) -> None:
+        """Pause and seek, and wait until the page shows the scan at a time. A long seek shows scans of the way.
+
+        Args:
+            time_s: Between two scans, or the time of one.
+        """
+        self.pause()
+        self.command({"type": "seek", "time_s": time_s})
+        there = f"it.time_s > {time_s} - 0.11 && it.time_s < {time_s} + 0.11"
+        self.until_server("/api/status", f"it.state === 'paused' && it.going_to === '' && {there}")
+        self.until_shown()
+
     def until_shown(self) -> None:
         """Wait until the page and the scene show the scan at which the server stands.
 

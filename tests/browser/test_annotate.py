@@ -181,7 +181,7 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     expect(dbh).to_have_value("31.5")
 
     # Delete, and all back to nothing.
-    line.click(position={"x": 5, "y": 5})
+    line.locator("td").first.click()
     canvas.press("Delete")
     person.until_server("/api/annotations", "it.trees.length === 2")
     mine = page.evaluate("() => localStorage.getItem('stemmap.browser')")
@@ -475,7 +475,7 @@ def test_a_chosen_annotation_and_the_card_are_one_selection(person: Dashboard):
 
     # In the table.
     row = page.locator("#annotations tbody tr").filter(has_text=str(second["number"])).first
-    row.click(position={"x": 5, "y": 5})
+    row.locator("td").first.click()
     expect(title).to_have_text(f"Tree {second['number']}")
     expect(row).to_have_attribute("aria-selected", "true")
     assert page.evaluate(RINGS) == 1
@@ -846,10 +846,10 @@ def test_the_line_with_undo_belongs_to_the_last_edit_and_undo_says_what_it_did(p
     expect(news).to_contain_text(f"Redone: the answer tree of tree {tree['number']}.")
 
     # The arrows move the annotation of a tree, and its line goes.
-    row.click(position={"x": 5, "y": 5})
+    row.locator("td").first.click()
     person.answer("Shift+P")
     expect(last).to_contain_text(f"Tree {tree['number']}: pole")
-    row.click(position={"x": 5, "y": 5})
+    row.locator("td").first.click()
     canvas.press("ArrowRight")
     expect(last).to_be_hidden()
     person.until_server("/api/annotations", "it.trees[0].version === 5")

@@ -20,7 +20,7 @@ def test_a_person_in_the_way_is_reported(dashboard: Dashboard):
     way = dashboard.page.locator("#way")
     dashboard.open("sim:crossing?duration=12")  # a person crosses the way at 9 s
     for time_s, zone, text in ((10.6, "stop", "Stop: obstacle"), (6.5, "clear", "")):
-        dashboard.command({"type": "seek", "time_s": time_s})
+        dashboard.go_to(time_s)
         dashboard.until("zone => document.getElementById('way').dataset.zone === zone", zone)
         if text:
             expect(way).to_contain_text(text)
@@ -69,8 +69,7 @@ THEME = "async (name) => (await import('/static/js/core/theme.js')).setTheme(nam
 def test_the_map_marks_the_obstacle_while_it_is_reported(dashboard: Dashboard):
     page = dashboard.page
     dashboard.open("sim:crossing?duration=12")
-    dashboard.pause()
-    dashboard.command({"type": "seek", "time_s": 10.6})
+    dashboard.go_to(10.6)
     expect(page.locator("#way")).to_contain_text("Stop: obstacle")
     dashboard.until(NAMED)
     for width, theme in ((390, "dark"), (390, "light"), (1440, "light"), (1440, "dark")):
@@ -80,7 +79,7 @@ def test_the_map_marks_the_obstacle_while_it_is_reported(dashboard: Dashboard):
         assert page.evaluate(RING, ""), (width, theme)
     assert not page.evaluate(RING, "finished"), "the data are old"
     assert page.evaluate(RING, "")
-    dashboard.command({"type": "seek", "time_s": 6.5})
+    dashboard.go_to(6.5)
     dashboard.until("() => !document.getElementById('legend-obstacle').checkVisibility()")
 
 
@@ -97,8 +96,7 @@ ON_TOP = """() => {
 def test_no_dialog_covers_the_stop_of_an_obstacle(dashboard: Dashboard):
     page = dashboard.page
     dashboard.open("sim:crossing?duration=12")
-    dashboard.pause()
-    dashboard.command({"type": "seek", "time_s": 10.6})
+    dashboard.go_to(10.6)
     expect(page.locator("#way")).to_contain_text("Stop: obstacle")
     for width, height in ((1280, 720), (390, 844)):
         page.set_viewport_size({"width": width, "height": height})
@@ -332,9 +330,7 @@ def test_sound_and_vibration_for_the_stop_zone_are_off_until_a_person_wants_them
     at_stop = "() => document.getElementById('way').dataset.zone === 'stop'"
 
     def drive_to_the_person() -> None:
-        dashboard.pause()  # else the run may play on past the place
-        dashboard.command({"type": "seek", "time_s": 9.0})
-        dashboard.until_server("/api/status", "it.time_s < 9.1 && it.time_s > 8.9")
+        dashboard.go_to(9.0)
         dashboard.command({"type": "play"})
         dashboard.until(at_stop)
 
