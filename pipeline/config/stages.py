@@ -373,7 +373,8 @@ class Tracking(Stage):
     """Minimum observed arc of the trunk for which a diameter is reported."""
 
     dbh_sigma_max: float = number(0.03, "Maximum sigma of DBH", "m", 0.005, 0.5, 0.005)
-    """Largest standard deviation of a reported diameter; a tree with a larger one has no diameter."""
+    """Largest standard deviation of a reported diameter of up to 30 cm; in proportion to the diameter above.
+    A tree with a larger one has no diameter."""
 
     breast_height: float = number(1.3, "Breast height", "m", 0.1, 5.0, 0.05)
     """Height above the ground of the reported diameter."""

@@ -33,6 +33,10 @@ ONE_VIEW, RADIUS_GAIN, CENTRE_GAIN = np.radians(140.0), 2.0, 2.3
 #: Least diameter of a trunk, in distances between returns: a sampled shape is resolved from two samples on
 #: (Nyquist). What returns measure of thinner trunks depends on the prior and on the undergrowth.
 RESOLVED = 2.0
+#: Diameter above which the largest standard deviation of a reported diameter grows in proportion [m], since
+#: errors by the shape of a stem do. A fixed limit would leave out thick stems, so that those with a diameter
+#: are too thin on average. With 0.3, a limit of 3 cm is 10 % of the diameter.
+THICK = 0.3
 NEAREST = 1.0  # m; the weight of a radius is limited to that at this distance
 
 
@@ -131,7 +135,7 @@ class FigureLimits(NamedTuple):
     Attributes:
         hits_to_confirm: Minimum number of detections of a tree without a class of a voxel column.
         dbh_arc_min: Minimum observed arc for a diameter [rad].
-        dbh_sigma_max: Maximum standard deviation of a diameter [m].
+        dbh_sigma_max: Maximum standard deviation of a diameter up to THICK [m].
         out_of_round: Standard deviation of the diameters of a stem in all directions, as a fraction of the
             DBH.
         taper_sigma: Standard deviation of the taper, change of the diameter per height [m/m].
@@ -235,7 +239,8 @@ def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) ->
 def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tuple[float, float]:
     """Return DBH [m] and its standard deviation [m] of the tree in row t; both NaN with fewer than
     DBH_OBSERVATIONS radii, an observed arc below `limits.dbh_arc_min`, a diameter below RESOLVED distances
-    between returns at the mean distance of the views, or a standard deviation above `limits.dbh_sigma_max`.
+    between returns at the mean distance of the views, or a standard deviation above `limits.dbh_sigma_max`
+    (in proportion to D for D > THICK).
 
     For a diameter D of n views at distances r, with a mean distance |h| from breast height:
 
@@ -265,6 +270,6 @@ def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tup
     shape = 1.0 + (RADIUS_GAIN * one_sidedness(coverage, 2)) ** 2
     stem = (limits.out_of_round * dbh) ** 2 * shape + (limits.taper_sigma * above) ** 2
     sigma = np.sqrt(4.0 * views + stem)
-    if sigma > limits.dbh_sigma_max:
+    if sigma > limits.dbh_sigma_max * max(1.0, dbh / THICK):
         return np.nan, np.nan
     return dbh, sigma

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 #: half, of which the outermost parts give few returns.
 VIEW_ARC = math.radians(120.0)
 #: Distances from which a view counts [m]: nearer, a stem fills the view; farther, beams of 0.2 degrees are
-#: more than 3 cm apart, the largest standard deviation of a diameter that is reported.
+#: more than 3 cm apart, the largest standard deviation of a reported diameter of up to 30 cm.
 NEAREST_VIEW, FARTHEST_VIEW = 1.0, 8.0
 #: Share of the trees without a diameter after which the way ends.
 MOST = 0.9

@@ -452,13 +452,14 @@ def test_a_view_without_a_circle_uses_the_radius_of_other_views():
     assert covered(1.2, np.nan) == 0.0, "a robot within a stem sees nothing of it"
 
 
-def test_a_diameter_needs_a_sigma_below_the_largest_one():
+@pytest.mark.parametrize(("radius", "share"), [(0.1, 1.0), (0.15, 1.0), (0.3, 2.0), (0.6, 4.0)])
+def test_a_diameter_needs_a_sigma_below_the_largest_one_in_proportion_above_30_cm(radius: float, share: float):
     t = tracker(dbh_arc_min=0.0, dbh_sigma_max=0.5)
     for k in range(4):
-        show(t, k, [[5.0, 0.0]], radius=0.2)
+        show(t, k, [[5.0, 0.0]], radius=radius)
     sigma = t.trees().dbh_sigma[0]
-    for largest, is_measured in ((1.001 * sigma, True), (0.999 * sigma, False)):
-        t.parameters = t.parameters.model_copy(update={"dbh_sigma_max": largest})
+    for factor, is_measured in ((1.001, True), (0.999, False)):
+        t.parameters = t.parameters.model_copy(update={"dbh_sigma_max": factor * sigma / share})
         assert np.isfinite(t.trees().dbh[0]) == is_measured
         assert np.isfinite(t.trees().dbh_sigma[0]) == is_measured
 
