@@ -21,11 +21,28 @@ PATIENCE_MS = 1000 * PATIENCE_S
 expect.set_options(timeout=PATIENCE_MS)
 
 
+# Files, and tests of other files, of the default run: what each user does on each visit, and answers that
+# must belong to the tree that was shown. All tests of this folder take longer than the default run may.
+_DEFAULT = {
+    "test_first_page.py",
+    "test_dashboard.py",
+    "test_loading.py",
+    "test_sizes.py",
+    "test_tune.py",
+    "test_way.py",
+    "test_trees_are_reviewed_added_edited_and_undone",
+    "test_quick_answers_belong_to_the_tree_on_the_card",
+    "test_a_held_key_and_keys_faster_than_a_look_answer_for_no_unseen_tree",
+}
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of this folder."""
+    """Mark the tests of this folder; those that do not belong to the default run are slow."""
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.browser)
+            if not _DEFAULT & {item.path.name, item.name.split("[")[0]}:
+                item.add_marker(pytest.mark.slow)
 
 
 # Not of the session: while Playwright runs, its event loop is the running one of the thread, and an

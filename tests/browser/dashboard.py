@@ -166,7 +166,9 @@ class Dashboard:
         self.until_shown()
 
     def go_to(self, time_s: float) -> None:
-        """Pause and seek, and wait until the page shows the scan at a time. A long seek shows scans of the way.
+        """Pause and seek, and wait until the page shows the scan at a time.
+
+        A long seek shows scans of the way, too.
 
         Args:
             time_s: Between two scans, or the time of one.

@@ -91,6 +91,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_again_when_a_function_or_a_constant_of_another_file_changes(folder):
     assert call(folder, 2.0, 1.0) == ["4.0", *COMPILED]
     assert call(folder, 2.0, 1.0) == ["4.0", *LOADED]
@@ -104,6 +105,7 @@ def test_a_change_is_seen_through_attributes_of_a_module(folder):
     assert call(folder, 5.0, 3.0) == ["20.0", *COMPILED]
 
 
+@pytest.mark.slow
 def test_processes_that_compile_a_kernel_for_different_types_at_once_store_all_of_them(folder):
     (folder / "wood" / "leaf.py").write_text(LEAF.format(factor=2.0, more=1.0))
     values = ["1", "1.0", "numpy.ones(1)", "numpy.ones((1, 1))"]
@@ -136,6 +138,7 @@ twice(1.0)
 """
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_while_it_stores_a_kernel_leaves_no_code_of_other_sources(folder):
     assert call(folder, 2.0, 1.0) == ["4.0", *COMPILED]
     assert call(folder, 5.0, 1.0, DIE_BETWEEN) == []
@@ -175,6 +178,7 @@ print(twice({name}(1.0)))
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_again_when_the_class_of_its_argument_is_renamed(folder):
     for name in ("Leaf", "Needle"):
         (folder / "wood" / "tree.py").write_text(OF_A_CLASS.format(name=name))
@@ -190,6 +194,7 @@ print(*(file.name for file in pathlib.Path("kept").rglob("*twice-*.nbc")))
 """
 
 
+@pytest.mark.slow
 def test_a_process_loads_the_machine_code_of_the_index_that_it_read_or_none(folder):
     """Sources change and change back while a process runs: two types never share a file name."""
     told, of_whole_numbers = call(folder, 2.0, 1.0, KEEP.format(value="1"))
@@ -200,6 +205,7 @@ def test_a_process_loads_the_machine_code_of_the_index_that_it_read_or_none(fold
     assert of_floats != of_whole_numbers
 
 
+@pytest.mark.slow
 def test_kernels_that_were_delivered_beside_their_sources_are_used_from_another_folder(folder):
     assert call(folder, 2.0, 1.0, in_tree=True) == ["4.0", *COMPILED]
     assert call(folder, 2.0, 1.0) == ["4.0", *LOADED]

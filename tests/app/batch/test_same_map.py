@@ -91,6 +91,7 @@ def trees(folder: Path) -> Float:
     return np.array(sorted(rows))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("one", "other"), [("bag", "db3"), ("bag", "mcap"), ("pcap", "packets")])
 def test_the_files_of_a_map_have_the_same_bytes_from_each_container(
     one: str, other: str, maps: dict[str, Path]

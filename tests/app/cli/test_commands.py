@@ -643,6 +643,7 @@ def test_a_map_whose_odometry_got_lost_ends_with_exit_code_3(warning, code, tmp_
     assert map_command.print_result([], tmp_path, [warning], {}, replaces=False, wrong=(LOST,)) == code
 
 
+@pytest.mark.slow
 def test_a_file_of_repairs_is_applied_to_the_map(mapped, tmp_path, capsys):
     before = [line.split(",") for line in (mapped / "trees.csv").read_text().splitlines()[1:]]
     x, y = map(float, before[0][1:3])

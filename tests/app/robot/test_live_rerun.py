@@ -103,6 +103,7 @@ def robot(run: Path) -> Iterator[Callable[..., Robot]]:
         each.session.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [FEWER, LATER, JUDGED])
 def test_what_came_so_far_is_mapped_again_while_more_comes(robot, parameters):
     here, other, wanted = robot(), robot(), robot(parameters)  # the last has them from its first scan on

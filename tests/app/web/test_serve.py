@@ -137,6 +137,7 @@ async def test_a_whole_session_over_sockets() -> None:
         await page.passed(2)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="the system does not list loaded libraries")
 async def test_the_web_process_shows_a_recording_without_numerical_libraries(tmp_path: Path) -> None:
     recording, source = tmp_path / "drive.mcap", open_source("sim:stand?duration=6")
@@ -148,6 +149,7 @@ async def test_the_web_process_shows_a_recording_without_numerical_libraries(tmp
         assert not [name for name in ("llvmlite", "scipy", "sklearn", "open3d") if f"/{name}/" in loaded]
 
 
+@pytest.mark.slow
 async def test_a_killed_worker_is_replaced_under_the_page() -> None:
     async with serving("sim:stand?duration=20") as server, server.browser() as (client, page):
         await page.passed(5)
@@ -160,6 +162,7 @@ async def test_a_killed_worker_is_replaced_under_the_page() -> None:
         await page.passed(3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 async def test_a_signal_ends_server_and_worker_without_output(number: signal.Signals) -> None:
     async with serving("sim:stand?duration=20") as server, server.browser() as (_, page):
@@ -174,6 +177,7 @@ async def test_a_signal_ends_server_and_worker_without_output(number: signal.Sig
         assert not runs(workers[0])
 
 
+@pytest.mark.slow
 async def test_the_recording_is_named_at_the_end(tmp_path: Path) -> None:
     file = tmp_path / "run.pcap"
     with socket.socket(type=socket.SOCK_DGRAM) as sender:
@@ -196,6 +200,7 @@ async def test_the_recording_is_named_at_the_end(tmp_path: Path) -> None:
         assert output.decode().endswith(f"Recording: {file}\n")
 
 
+@pytest.mark.slow
 async def test_a_browser_that_never_reads_leaves_no_traceback_at_the_end() -> None:
     async with serving("sim:stand?duration=20") as server, server.browser() as (_, page):
         address = httpx.URL(server.url)
@@ -264,6 +269,7 @@ async def test_a_port_in_use_prints_one_line() -> None:
     assert len(told.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 async def test_the_browser_is_started_without_the_token_and_no_file_remains(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

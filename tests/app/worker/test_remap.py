@@ -95,6 +95,7 @@ def remapped(session: Session) -> tuple[Frame, MapChanges]:
     raise AssertionError("it was given up")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER, JUDGED])
 def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters):
     current = session.status().scan_index
@@ -127,6 +128,7 @@ def test_the_observed_area_is_that_of_the_new_map(session):
         assert same == (wanted == BASE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [FEWER, WIDER])
 def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parameters):
     maps: dict[int, object] = {}
@@ -175,6 +177,7 @@ def places(frame: Frame) -> dict[int, tuple[float, float]]:
     return {int(frame.trees.number[row]): tuple(frame.trees.position[row].tolist()) for row in rows}
 
 
+@pytest.mark.slow
 def test_trees_that_stay_keep_their_numbers():
     few = BASE.replace({"classification.tree_share": 0.8})
     none = BASE.replace({"classification.tree_share": 1.0, "tracking.hits_to_confirm": 200})
@@ -223,6 +226,7 @@ def test_once_the_run_goes_on_a_map_that_was_left_is_made_again(session):
     assert (content_of(frame), content_of(session.shown.path)) == mapped_with(BASE, frame.index)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [FEWER, WIDER, LATER])
 def test_it_goes_on_and_back_as_if_it_had_been_so_from_the_start(session, parameters):
     session.set_parameters(parameters, 1, whole=True)
@@ -329,6 +333,7 @@ def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done, para
     assert content_of(frame) == mapped_with(parameters, 15)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [FEWER, LATER])
 def test_it_goes_on_while_the_run_plays(session, parameters):
     session.seek(1.0)

@@ -163,6 +163,7 @@ commands = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(commands)
 def test_whatever_is_done_the_picture_is_that_of_a_plain_run(done: list[tuple[str, float]]) -> None:
     session, model = opened(), Model()
@@ -207,6 +208,7 @@ impatient = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(impatient)
 def test_however_commands_overtake_one_another_a_scan_is_mapped_the_same(
     done: list[tuple[tuple[str, int], int]],
@@ -228,6 +230,7 @@ def test_however_commands_overtake_one_another_a_scan_is_mapped_the_same(
         assert checksum(session) == played({}, session.status().scan_index)
 
 
+@pytest.mark.slow
 @given(start=st.integers(0, 128), target=st.integers(0, 128), after=st.integers(0, 140), known=st.booleans())
 def test_a_change_on_the_way_acts_from_the_sought_scan_on(
     start: int, target: int, after: int, known: bool

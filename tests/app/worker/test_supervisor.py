@@ -368,6 +368,7 @@ async def test_a_worker_that_gets_no_processor_is_reported_and_not_replaced(
         await worker.close()
 
 
+@pytest.mark.slow
 async def test_a_command_that_is_not_answered_while_paused_replaces_the_worker() -> None:
     said = Said()
     worker = WorkerProcess(FAKE, silence_limit_s=2.0)

@@ -52,6 +52,7 @@ def away(place: Float, other: Float) -> Float:
     return distance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_walking_people_leave_no_tree_behind(seed):
     told, found = looks(seed, ("along", "ahead", "across", "pausing", "pausing"))
@@ -65,6 +66,7 @@ def test_walking_people_leave_no_tree_behind(seed):
     assert not left, left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_people_who_stand_still_for_a_minute_are_no_trees(seed):
     told, found = looks(seed, ("still", "still", "still", "still", "still", "by a trunk"))

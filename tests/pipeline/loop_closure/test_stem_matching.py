@@ -78,6 +78,7 @@ def test_a_forest_that_is_not_in_the_map_is_not_found_there(seed):
     assert match.reason in ("could be chance", "no agreement", "too few stems", "ambiguous")
 
 
+@pytest.mark.slow
 @given(seeds, st.floats(1.5, 5.0), st.floats(1.0, 1.6), st.floats(0.0, 0.1), st.floats(0.0, 0.2))
 def test_a_plantation_is_refused(seed, spacing, ratio, jitter, missing):
     rng = np.random.default_rng(seed)
@@ -106,6 +107,7 @@ def test_diameters_can_tell_the_rows_of_a_plantation_apart():
     assert blind.reason == "ambiguous"
 
 
+@pytest.mark.slow
 @given(seeds, st.floats(-3.1, 3.1), st.floats(-500, 500), st.floats(-500, 500))
 def test_the_pose_turns_with_the_local_frame(seed, yaw, x, y):
     rng = np.random.default_rng(seed)

@@ -453,7 +453,7 @@ def test_a_view_without_a_circle_uses_the_radius_of_other_views():
 
 
 @pytest.mark.parametrize(("radius", "share"), [(0.1, 1.0), (0.15, 1.0), (0.3, 2.0), (0.6, 4.0)])
-def test_a_diameter_needs_a_sigma_below_the_largest_one_in_proportion_above_30_cm(radius: float, share: float):
+def test_the_largest_sigma_of_a_diameter_is_in_proportion_to_it_above_30_cm(radius: float, share: float):
     t = tracker(dbh_arc_min=0.0, dbh_sigma_max=0.5)
     for k in range(4):
         show(t, k, [[5.0, 0.0]], radius=radius)

@@ -78,6 +78,7 @@ def test_a_stopped_search_goes_on_to_the_same_trials(whole, tmp_path):
     assert kept.used >= 6  # the start has the values of the first trial
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, -1])
 def test_trials_do_not_depend_on_which_of_two_processes_is_faster(order):
     made: list[list[Trial]] = []
@@ -150,6 +151,7 @@ def test_two_processes_make_as_many_trials_and_one_that_is_killed_is_replaced(wh
 # --- the command ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_set_with_its_provenance(tmp_path, capsys):
     words = ["tune", RUN, "--held-out", OTHER, "--trials", "3", "--out", str(tmp_path / "best.toml")]
     words += ["--keep", str(tmp_path / "results")]
