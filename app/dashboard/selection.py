@@ -1,12 +1,12 @@
 """Questions of the dashboard to the worker process about the shown run (explanations, comparisons, camera
-pictures), and the selection of one tree or cluster, which all browsers share."""
+pictures), and the selection of one tree or cluster."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 from collections.abc import Awaitable, Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from app.explain.records import ClusterStory, MapSection, TreeStory
@@ -165,10 +165,13 @@ class Selection:
     Attributes:
         tree: Number of the tree, or None.
         cluster: Explanation of the cluster at the time of its selection, or None.
+        by: Identity of the page that selected it; None for a click in the 3D scene, and for a run that
+            begins.
     """
 
     tree: int | None = None
     cluster: ClusterStory | None = None
+    by: str | None = None
 
     @property
     def ring(self) -> tuple[float, float, float] | None:
@@ -181,19 +184,23 @@ class Selection:
         return (*story.position, reach)
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the selection as a dict for the dashboard: `tree`, a number or None, and `cluster`, None or
-        a dict with `scan`, `cluster` (its row), `verdict`, `x` and `y` in the map [m]. The explanation is
-        requested separately."""
+        """Return the selection as a dict for the dashboard: `tree`, a number or None, `by`, and `cluster`,
+        None or a dict with `scan`, `cluster` (its row), `verdict`, `x` and `y` in the map [m]. The
+        explanation is requested separately."""
         story = self.cluster
         if story is None:
-            return {"tree": self.tree, "cluster": None}
+            return {"tree": self.tree, "by": self.by, "cluster": None}
         place = {"x": round(story.position[0], 4), "y": round(story.position[1], 4)}
         cluster = {"scan": story.scan, "cluster": story.cluster, "verdict": story.verdict, **place}
-        return {"tree": self.tree, "cluster": cluster}
+        return {"tree": self.tree, "by": self.by, "cluster": cluster}
 
 
 class Selector:
     """The selected tree or cluster, and its changes.
+
+    There is one selection, the newest one of all pages: the scene marks it, and the pages follow it. A page
+    on which a person annotates keeps its own tree instead, and needs to know which trees other pages have
+    selected.
 
     Args:
         dashboard: State of the run, with its scene and its worker.
@@ -203,16 +210,28 @@ class Selector:
         self.selection = Selection()
         self._dashboard = dashboard
         self._task: asyncio.Task[None] | None = None
+        self._place: tuple[float, float, float] | None = None
+        self._of_pages: dict[str, int] = {}
 
-    def tree(self, number: int | None) -> None:
-        """Select a tree, without a cluster, in place of the selection, and cancel a pending request; None
-        selects nothing. Whether the tree exists is not checked."""
+    def tree(self, number: int | None, by: str | None = None) -> None:
+        """Select a tree, without a cluster, in place of the selection, and cancel a pending request. Whether
+        the tree exists is not checked.
+
+        Args:
+            number: Number of the tree; None selects nothing.
+            by: As in `Selection`.
+        """
         self.leave()
-        self._select(Selection(number))
+        self._select(Selection(number, by=by))
 
-    async def cluster(self, scan: int, cluster: int) -> None:
+    async def cluster(self, scan: int, cluster: int, by: str | None = None) -> None:
         """Select a cluster of a recently displayed scan, with its tree, in place of the selection. The
         selection does not change if another run was opened meanwhile, or after an error.
+
+        Args:
+            scan: Index of the scan.
+            cluster: Row of the cluster.
+            by: As in `Selection`.
 
         Raises:
             NoStoryError: The cluster is no longer available, or no run is shown.
@@ -221,18 +240,19 @@ class Selector:
         run = self._dashboard.run
         story = await self.story(scan, cluster)
         if run == self._dashboard.run:  # else it was left meanwhile
-            self._select(Selection(story.tree, story))
+            self._select(Selection(story.tree, story, by))
 
-    def cluster_soon(self, scan: int, cluster: int) -> None:
+    def cluster_soon(self, scan: int, cluster: int, by: str | None = None) -> None:
         """Select a cluster in the background; of several calls the last one counts. If it does not exist, or
         the worker does not answer in time, the browsers receive the message "missing" with the reason.
 
         Args:
             scan: Index of the scan.
             cluster: Row of the cluster.
+            by: As in `Selection`.
         """
         self.leave()
-        self._task = asyncio.create_task(self._if_known(scan, cluster), name="select")
+        self._task = asyncio.create_task(self._if_known(scan, cluster, by), name="select")
 
     async def story(self, scan: int | None, cluster: int) -> ClusterStory:
         """Return the explanation of a cluster of a recent scan. For the selected cluster, given by its scan,
@@ -260,25 +280,42 @@ class Selector:
             trees: Numbers of the trees that vanished.
         """
         if self.selection.tree in trees:
-            self._select(Selection(None, self.selection.cluster))
+            self._select(replace(self.selection, tree=None))
+
+    def close_page(self, page: str | None) -> None:
+        """Forget what a page has selected, because it was closed; the selection stays."""
+        if page in self._of_pages:
+            del self._of_pages[page]
+            self._publish()
 
     def leave(self) -> None:
         """Cancel the pending request for an explanation."""
         if self._task is not None:
             self._task.cancel()
 
-    async def _if_known(self, scan: int, cluster: int) -> None:
+    async def _if_known(self, scan: int, cluster: int, by: str | None) -> None:
         """Select a cluster; if it does not exist, or the worker does not answer in time, broadcast the
         message "missing"."""
         try:
-            await self.cluster(scan, cluster)
+            await self.cluster(scan, cluster, by)
         except StemmapError as error:
             self._dashboard.live.publish("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
 
     def _select(self, selection: Selection) -> None:
-        """Set the selection, highlight it in the scene, broadcast it with its `place`, and clear the message
-        "missing"."""
+        """Set the selection, highlight it in the scene, broadcast it, and clear the message "missing"."""
         self.selection = selection
-        place = self._dashboard.scene.select(selection.tree, selection.ring)
-        self._dashboard.live.publish("selection", {**selection.as_plain(), "place": place})
+        self._place = self._dashboard.scene.select(selection.tree, selection.ring)
+        if selection.by is None:  # all pages follow
+            self._of_pages.clear()
+        elif selection.tree is None:
+            self._of_pages.pop(selection.by, None)
+        else:
+            self._of_pages[selection.by] = selection.tree
+        self._publish()
         self._dashboard.live.publish("missing", None)
+
+    def _publish(self) -> None:
+        """Broadcast the selection with its `place`, the tree of each page that has selected one, and the
+        number of the run: a page that annotates does not keep a tree of the run before."""
+        content = {"place": self._place, "pages": self._of_pages, "run": self._dashboard.run}
+        self._dashboard.live.publish("selection", {**self.selection.as_plain(), **content})

@@ -961,6 +961,47 @@ def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
     assert person.errors == []
 
 
+def test_two_annotators_get_different_trees_and_a_page_on_another_tab_follows(
+    person: Dashboard, chromium: Browser, server: Server
+):
+    first, second, *_ = doubted(person)
+    numbers = [tree["number"] for tree in (first, second)]
+    title = person.page.locator("#review-title")
+    with opened_by_another(chromium, server.link) as other:
+        theirs = other.page.locator("#review-title")
+        row = other.page.locator(f"#trees tr[data-tree='{numbers[0]}']")
+        person.page.locator("#map").press("s")
+        expect(title).to_have_text(f"Tree {numbers[0]}")
+        expect(row).to_have_attribute("aria-selected", "true")  # on the tab Trees
+
+        # The tree that the other page followed is left to who answers for it.
+        other.tab("Annotate")
+        expect(theirs).to_have_text(f"Tree {numbers[0]}")
+        expect(other.page.locator("#annotate-next")).to_have_text("Next (S)")
+        other.page.locator("#map").press("s")
+        expect(theirs).to_have_text(f"Tree {numbers[1]}")
+        held = "() => import('/static/js/core/store.js').then(({ state }) => state.selectedByOthers)"
+        person.eventually(
+            lambda: person.page.evaluate(held) == [numbers[1]], lambda: person.page.evaluate(held)
+        )
+        assert person.ask("/api/annotations")["skipped"] == []
+
+        expect(title).to_have_text(f"Tree {numbers[0]}")
+        person.answer("y")
+        person.until_server("/api/annotations", "it.trees.length === 1")
+        expect(title).not_to_have_text(re.compile(rf"^Tree ({numbers[0]}|{numbers[1]})\b"))
+        expect(theirs).to_have_text(f"Tree {numbers[1]}")
+
+        other.tab("Trees")
+        person.answer("y")
+        expect(title).to_have_text(re.compile(r"^Tree \d+$"))
+        number = title.inner_text().split()[1]
+        row = other.page.locator(f"#trees tr[data-tree='{number}']")
+        expect(row).to_have_attribute("aria-selected", "true")
+        assert other.errors == []
+    assert person.errors == []
+
+
 @pytest.mark.slow
 def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser, tmp_path: Path):
     with Server(STEMMAP_FOLDER=str(tmp_path)) as first, opened(chromium, first.link) as person:

@@ -16,7 +16,7 @@ from typing import Annotated
 from urllib.parse import quote, urlsplit
 
 import msgspec
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from msgspec import Meta
 from starlette.responses import FileResponse, HTMLResponse, RedirectResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -27,7 +27,7 @@ from app.dashboard.dashboard import Dashboard
 from app.extension import EXTENSION_PAGES, extensions_on, static_folder
 from app.web.auth import HEALTH, AccessTokens, role_of, ticket
 from app.web.responses import LARGEST_NUMBER, error_reply, json_reply
-from app.web.routes.access import Bounds, CallerRole, Dash
+from app.web.routes.access import BROWSER, Bounds, CallerRole, Dash
 from app.web.viser_proxy import bridge, client_page
 from pipeline.errors import StemmapError
 
@@ -242,13 +242,13 @@ _Number = Annotated[int, Meta(ge=0, le=LARGEST_NUMBER)]
 
 
 class _Select(msgspec.Struct, frozen=True, tag="select"):
-    """Select a tree for everybody; null selects nothing."""
+    """Select a tree; null selects nothing."""
 
     tree: _Number | None
 
 
 class _SelectCluster(msgspec.Struct, frozen=True, tag="select_cluster"):
-    """Select a cluster of a scan for everybody, with the tree that it belongs to."""
+    """Select a cluster of a scan, with the tree that it belongs to."""
 
     scan: _Number
     cluster: _Number
@@ -258,23 +258,34 @@ _decoder: msgspec.json.Decoder[_Select | _SelectCluster] = msgspec.json.Decoder(
 
 
 @router.websocket("/api/live")
-async def live(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
-    """WebSocket /api/live: send states as they change, the newest of each kind, and receive selections; those
-    of viewers are ignored. The websocket is closed with 1013 before it is accepted if too many pages are
-    open, and with 1003 after an invalid message."""
+async def live(
+    browser: WebSocket,
+    dashboard: Dash,
+    bounds: Bounds,
+    role: CallerRole,
+    page: Annotated[str | None, Query(pattern=BROWSER)] = None,
+) -> None:
+    """WebSocket /api/live: send states as they change, the newest of each kind, and receive selections, which
+    are those of `page`, an identity that the page has chosen; those of viewers are ignored. The websocket is
+    closed with 1013 before it is accepted if too many pages are open, and with 1003 after an invalid
+    message."""
     with bounds.pages.place(role):
         await browser.accept()
-        async with telling(browser, dashboard.live):
-            await _receive(browser, dashboard, may_select=role == "owner")
+        try:
+            async with telling(browser, dashboard.live):
+                await _receive(browser, dashboard, page, may_select=role == "owner")
+        finally:
+            dashboard.selector.close_page(page)
 
 
-async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool) -> None:
+async def _receive(browser: WebSocket, dashboard: Dashboard, page: str | None, *, may_select: bool) -> None:
     """Process the selections of a browser until it disconnects; an invalid message closes the websocket
     (1003).
 
     Args:
         browser: Websocket of the browser.
         dashboard: The dashboard, whose selection changes.
+        page: Identity of the page, see `Selection`.
         may_select: Whether valid selections are processed; otherwise they are ignored.
     """
     while (event := await browser.receive())["type"] != "websocket.disconnect":
@@ -283,12 +294,12 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool
         except (msgspec.MsgspecError, UnicodeDecodeError):
             await browser.close(_REFUSED, "not a message of the page")
             return
-        if not may_select:  # the selection is shared by everybody
+        if not may_select:  # other pages follow the selection
             continue
         if isinstance(wanted, _SelectCluster):
-            dashboard.selector.cluster_soon(wanted.scan, wanted.cluster)
+            dashboard.selector.cluster_soon(wanted.scan, wanted.cluster, page)
         else:
-            dashboard.selector.tree(wanted.tree)
+            dashboard.selector.tree(wanted.tree, page)
 
 
 @router.websocket("/viser")

@@ -1,7 +1,7 @@
 // Annotations: what a person states about trees. Edits go to the server one at a time and come back to all browsers.
 
 import { get, put, request } from "../core/api.js";
-import { byId, recall, remember } from "../core/dom.js";
+import { byId, randomId, recall, remember } from "../core/dom.js";
 import { count, dbhFigure, share } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
@@ -24,7 +24,7 @@ const MOST_ANSWERED = 20; // answers to which the review returns
 // takes about 300 ms from the picture to the key (Donders 1868, Hick 1952), but three answers per second leave 333 ms between two
 // keys, of which the next card needs a part.
 const LOOK = 150;
-// [ms] the same where another browser or a click in the scene selected the tree: the answer to the tree before may be on its way. A
+// [ms] the same where another page or a click in the scene selected the tree: the answer to the tree before may be on its way. A
 // choice between up to ten answers takes less than a second (Hick 1952).
 const LOOK_UNASKED = 1000;
 // [ms] between two clicks on the answers that are one double click: the default of GTK (gtk-double-click-time).
@@ -64,7 +64,7 @@ export const news = () => changed("annotating");
 function browser() {
   const known = recall("browser");
   if (/^[0-9a-f]{32}$/.test(known ?? "")) return known;
-  const made = [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+  const made = randomId();
   remember("browser", made);
   return made;
 }
@@ -286,10 +286,13 @@ const compared = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
 
 const skippedAt = (tree) => annotationOf(tree)?.at_s ?? 0; // 0: open
 
+// Another person may be answering for it.
+const isSelectedByOther = ({ number }) => state.selectedByOthers.includes(number);
+
 // Found trees that are open or skipped. Open trees come first, sorted by doubt and then by the number of observations; skipped
-// trees follow in the order in which they were skipped.
+// trees follow in the order in which they were skipped. Trees that other pages have selected come last.
 export const unreviewed = () => trees().filter((tree) => !isReviewed(tree) && !answering.has(tree.number)).sort((a, b) =>
-  skippedAt(a) - skippedAt(b) || compared(margin(a), margin(b)) || a.observations - b.observations || a.number - b.number);
+  isSelectedByOther(a) - isSelectedByOther(b) || skippedAt(a) - skippedAt(b) || compared(margin(a), margin(b)) || a.observations - b.observations || a.number - b.number);
 
 export const isReviewed = (tree) => (annotationOf(tree)?.kind ?? SKIPPED) !== SKIPPED;
 
@@ -409,15 +412,18 @@ export function measureDbh(tree, dbh, goesOn) {
   return answer(tree, isReviewed(tree) ? row.kind : "tree", { dbh_cm: dbh }, goesOn);
 }
 
+// Whether Next marks the tree as skipped: an open one that no other page has selected.
+export const isSkippable = (tree) => reviewOf(tree) === "open" && !isSelectedByOther(tree);
+
 // Marks the tree on the card as skipped if it is open, and goes on to the next one.
 export async function skip() {
   const tree = selectedTree();
   draft.error = "";
-  if (!tree || reviewOf(tree) !== "open" || answering.has(tree.number)) await next();
+  if (!tree || !isSkippable(tree) || answering.has(tree.number)) await next();
   else await answerIfSeen(tree, SKIPPED);
 }
 
-// Selects the most doubtful open tree other than the selected one; without one, the skipped tree that follows the selected one.
+// Selects the most doubtful open tree that no page has selected; without one, the tree that follows the selected one.
 // The order needs the votes: a key pressed before they have arrived waits for them.
 async function next() {
   if (!votes.known) await updateVotes.now();
@@ -442,7 +448,7 @@ export function showCard() {
 // The trees that the review shows after the selected one, the next one first.
 export function following() {
   const left = unreviewed(), at = left.findIndex(({ number }) => number === state.selected);
-  const open = left.filter((each) => each.number !== state.selected && reviewOf(each) === "open");
+  const open = left.filter((each) => each.number !== state.selected && reviewOf(each) === "open" && !isSelectedByOther(each));
   return open.length ? open : [...left.slice(at + 1), ...left.slice(0, at + 1)];
 }
 
@@ -576,7 +582,10 @@ export function startAnnotating() {
   });
   on("annotations map selection", keepOneSelection);
   on("selection", forgetTreeBefore);
-  on("tab", () => annotating() && showCard());
+  on("tab", () => {
+    state.keepsSelection = annotating();
+    if (annotating()) showCard();
+  });
   on("remapped", () => { votes = NO_VOTES; }); // numbers may belong to other trees now
   on("map tab", () => { if (annotating()) updateVotes(); });
   on("tab", () => annotating() || !draft.adding || toggleAdding(false));

@@ -200,4 +200,5 @@ export function fillCard() {
 export function startCard() {
   on("map", throttled(refresh, EVERY));
   on("tab selection", select);
+  on("others", () => { if (annotating() && selectedTree()) loadAhead(); });
 }

@@ -14,7 +14,7 @@ import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, moreEvidence, startCard, typeDbh } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -163,7 +163,7 @@ function fill() {
   for (const id of ["add", "import"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !state.annotations?.run;
   for (const id of ["yes", "no"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !(selected ?? chosen);
   byId("annotate-next").disabled = !left.length;
-  setText(byId("annotate-next"), selected && reviewOf(selected) === "open" ? "Skip (S)" : "Next (S)");
+  setText(byId("annotate-next"), selected && isSkippable(selected) ? "Skip (S)" : "Next (S)");
   const states = trees().map(reviewOf);
   for (const each of STATES) setText(byId(`annotate-${each}`), `${states.filter((one) => one === each).length} ${each}`);
   byId("annotate-add").setAttribute("aria-pressed", String(draft.adding));
@@ -228,7 +228,7 @@ export function startAnnotatePanel() {
   on("map", throttled(fill, EVERY));
   on("annotating", () => { if (draft.error || draft.adding) imported = ""; fill(); });
   on("selection", () => { imported = ""; });
-  on("tab annotations selection", fill);
+  on("tab annotations selection others", fill);
 }
 
 // --- keys of the tab; they act while it is open, unless a person types -----------------------------------

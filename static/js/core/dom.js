@@ -42,3 +42,6 @@ export function recall(key, storage = "localStorage") {
     return null;
   }
 }
+
+// 32 hexadecimal digits.
+export const randomId = () => [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");

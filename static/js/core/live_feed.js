@@ -1,12 +1,16 @@
-// Messages of the open run from the server, and the selection that is shared with it.
+// Messages of the open run from the server, and the selection. The server holds one selection, the newest one of all pages, which the
+// scene marks. A page follows it, or keeps its own one (`keepsSelection`).
 
+import { randomId } from "./dom.js";
 import { looksOnly } from "./permissions.js";
 import { connectTo } from "./socket.js";
 import { changed, state } from "./store.js";
 
 const ANSWER_WAIT = 3000; // [ms] for which a selection made here overrules what the server still sends
 let sendMessage = () => false;
+const page = randomId(); // until the page is loaded again
 let chosen = null; // {tree, until}: selected here, not yet confirmed by the server
+let run = null; // number of the run of the last selection
 
 const receivers = {
   status(message) { Object.assign(state, { status: message, statusAt: performance.now() }); },
@@ -17,7 +21,7 @@ const receivers = {
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   annotations(message) { state.annotations = message; },
-  selection(message) { receiveSelection(message.tree ?? null, message.cluster ?? null, message.place ?? null); },
+  selection: receiveSelection,
   events(message) { Object.assign(state, { events: message.events, eventsStart: message.start_s }); },
   view(message) { state.view = message; },
   remapped(message) { state.remapped = message.ghost ? message : null; },
@@ -26,7 +30,7 @@ const receivers = {
   missing(message) { state.missing = message; },
 };
 
-// A further kind of message, as of an extension.
+// A further kind of message, as of an extension. A receiver returns false if it has changed nothing.
 export const receive = (type, receiver) => { receivers[type] = receiver; };
 
 function receiveMap({ path, ...map }) {
@@ -39,21 +43,24 @@ function receiveMap({ path, ...map }) {
   }
 }
 
-// An answer to an earlier click must not undo a later one.
-function receiveSelection(tree, cluster, place) {
-  if (chosen && chosen.tree !== tree && performance.now() < chosen.until) return;
+// An answer to an earlier click must not undo a later one. Of another run than before, numbers of trees mean nothing any more.
+function receiveSelection({ tree, cluster, place, by, pages, run: now }) {
+  state.selectedByOthers = Object.entries(pages).filter(([each]) => each !== page).map(([, number]) => number);
+  const isKept = state.keepsSelection && ![null, page].includes(by) && now === run;
+  run = now;
+  changed("others");
+  if (isKept || (chosen && chosen.tree !== tree && performance.now() < chosen.until)) return false;
   chosen = null;
   if (tree !== state.selected) state.selectedElsewhere = true;
   Object.assign(state, { selected: tree, selectedCluster: cluster, place });
+  return true;
 }
 
 export function connect() {
-  sendMessage = connectTo("/api/live", {
+  sendMessage = connectTo(`/api/live?page=${page}`, {
     onMessage(message) {
       state.heardAt = performance.now();
-      if (!receivers[message.type]) return;
-      receivers[message.type](message);
-      changed(message.type);
+      if (receivers[message.type] && receivers[message.type](message) !== false) changed(message.type);
     },
     onOpen() {
       chosen = null; // a message sent over the lost connection may not have arrived

@@ -12,7 +12,9 @@ export const state = {
   sets: null,        // {sets: [{name, who, at_s}]}: saved sets of parameters
   holds: null,       // test of a tree by the filter of the table; null without a filter
   selected: null,    // number of the selected tree
-  selectedElsewhere: false, // whether the server chose it: for another browser, or by a click in the scene
+  selectedElsewhere: false, // whether the server chose it: for another page, or by a click in the scene
+  selectedByOthers: [], // numbers of the trees that other pages have selected
+  keepsSelection: false, // whether the selections of other pages leave that of this page as it is: while it shows the tab Annotate
   place: null,       // [x, y, z] of the selection on the ground, once the server has answered
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when selected
   selectedTruth: null, // object of the ground truth without a tree or a cluster of this scan, when clicked

@@ -57,6 +57,39 @@ async def diameters(page: ClientConnection, last_cm: float) -> list[float]:
     return told
 
 
+async def selection(page: ClientConnection, **wanted: Any) -> dict[str, Any]:
+    """Return the next selection that a page was told with these values."""
+    async with asyncio.timeout(20):
+        while True:
+            message: dict[str, Any] = json.loads(await page.recv())
+            if message["type"] == "selection" and wanted.items() <= message.items():
+                return message
+
+
+async def test_a_selection_names_its_page_and_what_the_open_pages_have_selected() -> None:
+    ann, bob = "a" * 32, "b" * 32
+    async with (
+        shared() as (host, dashboard, _),
+        connect(f"ws://{host}/api/live?page={ann}", additional_headers=BEARER, proxy=None) as one,
+    ):
+        await one.send('{"type":"select","tree":1}')
+        assert (await selection(one, tree=1))["by"] == ann
+        address = f"ws://{host}/api/live?page={bob}"
+        async with connect(address, additional_headers=BEARER, proxy=None) as other:
+            await other.send('{"type":"select","tree":2}')
+            told = await selection(one, tree=2)
+            assert (told["by"], told["pages"], told["run"]) == (bob, {ann: 1, bob: 2}, 1)
+        assert (await selection(one, tree=2, pages={ann: 1}))["by"] == bob  # the other page was closed
+        dashboard.selector.remove([2])
+        assert (await selection(one, tree=None, pages={ann: 1}))["by"] == bob
+        await dashboard.select_tree(3)  # a click in the scene
+        assert (await selection(one, tree=3, pages={}))["by"] is None
+        await one.send('{"type":"select","tree":1}')
+        assert (await selection(one, tree=1))["pages"] == {ann: 1}
+        await one.send('{"type":"select","tree":null}')
+        assert (await selection(one, tree=None))["pages"] == {}
+
+
 async def test_of_two_edits_of_a_tree_at_once_one_is_taken_and_the_other_is_told_to_look_again() -> None:
     async with (
         shared() as (host, _, client),
