@@ -241,6 +241,12 @@ class AnnotationEditor:
         self.frame = next((row for row in stored if row.content.kind == FRAME), None)
         self.truth = truth_of(self._own, self.rows, self.against)
 
+    @property
+    def in_truth(self) -> list[Content]:
+        """The annotations that are objects of `truth`: its last ones, in this order."""
+        used = counted(self._own, self.rows, self.against)
+        return [row.content for row in self.rows] if used in ("annotations", "both") else []
+
     def score_against(self, against: Against) -> None:
         """Choose the ground truth for the scores, see `truth_of`, and call `changed`. No annotation
         changes."""

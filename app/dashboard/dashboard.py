@@ -429,7 +429,7 @@ class Dashboard:
         """Show the ground truth with the annotations in scene and browsers, and request the score of the map
         against it; without ground truth the score is removed."""
         self.scene.show_truth(self.truth)
-        self.live.publish("truth", truth_payload(self.truth))
+        self.live.publish("truth", truth_payload(self.truth, self.annotation_editor.in_truth))
         self.live.publish("annotations", self.annotation_editor.as_plain())
         if self.truth is None:
             self.scores.forget()

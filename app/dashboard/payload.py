@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from app.common.height_range import height_range
 from app.explain.records import half_axes
+from app.store.records import Content
 from app.worker.course import QUANTITIES
 from app.worker.protocol import RunCourse, Shown
 from pipeline.config import Parameters
@@ -220,13 +221,22 @@ def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:
     return {Verdict(int(values[k])).label: int(counts[k]) for k in order}
 
 
-def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
+def truth_payload(truth: TruthTrees | None, annotations: Sequence[Content] = ()) -> dict[str, Any] | None:
     """Return {"trees": [...]}, a list of a dict for each object of the ground truth, of any class, with `x`,
-    `y` [m], `dbh_cm` (None if unknown) and `kind`; None for None."""
+    `y` [m], `dbh_cm` (None if unknown) and `kind`; None for None.
+
+    Args:
+        truth: The ground truth.
+        annotations: The annotations in it, whose objects are its last ones. Their dicts have also `annotated`
+            (True) and `taped`, whether the DBH is that of the annotation.
+    """
     if truth is None:
         return None
-    rows = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
-    return {"trees": [{"x": x, "y": y, "dbh_cm": dbh, "kind": kind} for x, y, dbh, kind in rows]}
+    columns = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
+    rows: list[dict[str, Any]] = [{"x": x, "y": y, "dbh_cm": dbh, "kind": kind} for x, y, dbh, kind in columns]
+    for row, content in zip(rows[len(rows) - len(annotations) :], annotations, strict=True):
+        row.update(annotated=True, taped=content.dbh is not None)
+    return {"trees": rows}
 
 
 def _rounded(values: Float) -> list[float]:

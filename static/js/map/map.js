@@ -67,18 +67,11 @@ const gapTo = (at) => (place) => {
 const clusterAt = (at) => nearest(clusters(), gapTo(at), POINT_REACH);
 const truthAt = (at) => nearest(state.truth ?? [], gapTo(at), POINT_REACH);
 
-// Index of the first object of the ground truth that has an annotation: they come last, in the order of the annotations (`laid_over`).
-function annotatedFrom() {
-  const used = ["annotations", "both"].includes(state.annotations?.used) ? annotations().length : 0;
-  return (state.truth?.length ?? 0) - used;
-}
-
 // A confirmed tree without a DBH by tape has that of the ground truth.
-function truthText(truth) {
-  const { kind, dbh_cm: dbh } = truth, row = annotations()[state.truth.indexOf(truth) - annotatedFrom()];
-  const dbhPart = dbh !== null ? dbhText(truth) : kind === "tree" ? "DBH unknown" : "";
-  if (row && row.dbh_cm === null && dbh !== null) return `Annotation: ${kind}\nGround truth: ${dbhPart}`;
-  return `${row ? "Annotation" : "Ground truth"}: ${[kind, dbhPart].filter(Boolean).join(", ")}`;
+function truthText({ kind, dbh_cm: dbh, annotated, taped }) {
+  const dbhPart = dbh !== null ? dbhText({ dbh_cm: dbh }) : kind === "tree" ? "DBH unknown" : "";
+  if (annotated && !taped && dbh !== null) return `Annotation: ${kind}\nGround truth: ${dbhPart}`;
+  return `${annotated ? "Annotation" : "Ground truth"}: ${[kind, dbhPart].filter(Boolean).join(", ")}`;
 }
 
 function describe(at) {
@@ -118,7 +111,7 @@ const isRejected = (tree) => reviewOf(tree) === "rejected";
 // The legend names what the map shows.
 function showLegend() {
   const truth = state.truth ?? [], others = [...truth.filter(({ kind }) => kind !== "tree"), ...classedThings(state)];
-  const isTree = ({ kind }) => kind === "tree", byPeople = truth.slice(annotatedFrom()).some(isTree), ofRun = truth.slice(0, annotatedFrom()).some(isTree);
+  const isTree = ({ kind }) => kind === "tree", byPeople = truth.some((each) => isTree(each) && each.annotated), ofRun = truth.some((each) => isTree(each) && !each.annotated);
   const shown = { truth: byPeople || ofRun, other: others.length,
     hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, obstacle: Boolean(state.obstacle), ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
