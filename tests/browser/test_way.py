@@ -62,6 +62,18 @@ RING = """async (word) => {
   changed('status');
   return isSeen;
 }"""
+# Whether the ring in the legend has the colour of a zone.
+LEGEND = """async (zone) => {
+  const [{ state, changed }, { colour }] = await Promise.all(
+    [import('/static/js/core/store.js'), import('/static/js/core/theme.js')]);
+  state.map.clearance = { ...state.map.clearance, zone };
+  changed('status');
+  await new Promise((resolve) => setTimeout(resolve, 1100)); // longer than two updates of the legend
+  const box = document.createElement('i');
+  box.style.color = colour(zone === 'stop' ? 'pole' : 'warn');
+  const ring = getComputedStyle(document.getElementById('legend-obstacle'), '::before');
+  return ring.borderTopColor === box.style.color;
+}"""
 NAMED = "() => document.getElementById('legend-obstacle').checkVisibility()"
 THEME = "async (name) => (await import('/static/js/core/theme.js')).setTheme(name)"
 
@@ -77,6 +89,8 @@ def test_the_map_marks_the_obstacle_while_it_is_reported(dashboard: Dashboard):
         page.evaluate(THEME, theme)
         dashboard.drawn()
         assert page.evaluate(RING, ""), (width, theme)
+    for zone in ("slow", "stop"):
+        assert page.evaluate(LEGEND, zone), zone
     assert not page.evaluate(RING, "finished"), "the data are old"
     assert page.evaluate(RING, "")
     dashboard.go_to(6.5)

@@ -115,6 +115,7 @@ function showLegend() {
   const shown = { truth: byPeople || ofRun, other: others.length,
     hollow: trees().some((tree) => tree.dbh_cm === null), unseen: trees().some((tree) => tree.sides != null), odometry: isDrive() && state.path.length, obstacle: Boolean(state.obstacle), ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
+  byId("legend-obstacle").dataset.zone = state.obstacle?.zone ?? "";
   setText(byId("legend-truth"), !byPeople ? "true tree" : ofRun ? "reference tree" : "annotated tree");
   const kinds = [...new Set(others.map(({ kind }) => kind))].sort(), named = kinds.map((kind) => `${verdictOf(kind)[0]} ${kind}`).join(", ");
   setText(byId("legend-other"), kinds.length > 1 ? `other: ${kinds.map((kind) => verdictOf(kind)[0]).join(" ")}` : named);
