@@ -390,20 +390,23 @@ class ImportPlan:
         filled: Id, version and new content of each annotation that gets a DBH.
         conflicts: The annotation and the row that contradicts it, of each row that is left out for that.
         repeated: Number of rows that say nothing new.
+        beside: Distance from its annotation, of each row that lies beside it [m].
     """
 
     added: list[Content]
     filled: list[tuple[int, int, Content | None]]
     conflicts: list[tuple[Content, Content]]
     repeated: int
+    beside: list[float]
 
 
 def import_plan(rows: Sequence[Annotation], contents: Sequence[Content]) -> ImportPlan:
     """Return what an import of a table does.
 
-    A row at the place of an annotation, or of an earlier row, adds no second annotation there. It gives its
-    DBH to one of the same class without DBH. With another class or another DBH it is a conflict, and nothing
-    is stored.
+    A row within SAME_THING of an annotation is about the same object, and adds no second annotation; only the
+    nearest row is about it, so that two stems of a table stay two. A row at the place of an earlier row is
+    about the object of that row. A row gives its DBH to an annotation of the same class without DBH. With
+    another class or another DBH it is a conflict, and nothing is stored.
 
     Args:
         rows: The annotations of objects.
@@ -413,14 +416,15 @@ def import_plan(rows: Sequence[Annotation], contents: Sequence[Content]) -> Impo
 
     known = [*(row.content for row in rows), *contents]
     at = cKDTree(np.array([(each.x, each.y) for each in known]).reshape(-1, 2))
-    stored, filled = set(range(len(rows))), set[int]()
-    conflicts = list[tuple[Content, Content]]()
+    same = _same_things(known, len(rows))
+    object_of = {j: j for j in range(len(rows))} | {k: j for k, (j, _) in same.items()}
+    filled, conflicts = set[int](), list[tuple[Content, Content]]()
     for k, content in enumerate(contents, start=len(rows)):
-        near = stored.intersection(at.query_ball_point((content.x, content.y), _SAME_PLACE))
-        if not near:
-            stored.add(k)
-            continue
-        j = min(near, key=lambda j: (known[j].kind != content.kind, j))
+        if k not in same:
+            near = at.query_ball_point((content.x, content.y), _SAME_PLACE)
+            objects = {object_of[j] for j in near if j in object_of}
+            object_of[k] = min(objects, key=lambda j: (known[j].kind != content.kind, j), default=k)
+        j = object_of[k]
         here = known[j]
         if here.kind != content.kind:
             conflicts.append((here, content))
@@ -429,11 +433,37 @@ def import_plan(rows: Sequence[Annotation], contents: Sequence[Content]) -> Impo
             filled.add(j)
         elif here.dbh is not None and content.dbh is not None and abs(here.dbh - content.dbh) > _SAME_DBH:
             conflicts.append((here, content))
-    added = [known[j] for j in sorted(stored) if j >= len(rows)]
+    added = [known[j] for j in range(len(rows), len(known)) if object_of[j] == j]
     changed = list[tuple[int, int, Content | None]]()
     changed += [(row.id, row.version, known[j]) for j, row in enumerate(rows) if j in filled]
     repeated = len(contents) - len(added) - len(changed) - len(conflicts)
-    return ImportPlan(added, changed, conflicts, repeated)
+    beside = [distance for _, distance in same.values() if distance > _SAME_PLACE]
+    return ImportPlan(added, changed, conflicts, repeated, beside)
+
+
+def _same_things(known: Sequence[Content], number: int) -> dict[int, tuple[int, float]]:
+    """Return by the index of a row the index and the distance [m] of the annotation of the same object. The
+    nearest pairs are found first, and at one place those of one class.
+
+    Args:
+        known: The annotations and the rows.
+        number: Number of annotations, which come first.
+    """
+    from scipy.spatial import cKDTree
+
+    places = np.array([(each.x, each.y) for each in known]).reshape(-1, 2)
+    near = cKDTree(places[number:]).query_ball_tree(cKDTree(places[:number]), SAME_THING)
+    pairs = [
+        (max(math.dist(places[k], places[j]), _SAME_PLACE), known[k].kind != known[j].kind, k, j)
+        for k, annotations in enumerate(near, start=number)
+        for j in annotations
+    ]
+    same, taken = dict[int, tuple[int, float]](), set[int]()
+    for distance, _, k, j in sorted(pairs):
+        if k not in same and j not in taken:
+            same[k] = j, distance
+            taken.add(j)
+    return same
 
 
 def carried_by(

@@ -233,7 +233,9 @@ def truth_payload(truth: TruthTrees | None, annotations: Sequence[Content] = ())
     if truth is None:
         return None
     columns = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
-    rows: list[dict[str, Any]] = [{"x": x, "y": y, "dbh_cm": dbh, "kind": kind} for x, y, dbh, kind in columns]
+    rows: list[dict[str, Any]] = [
+        {"x": x, "y": y, "dbh_cm": dbh, "kind": kind} for x, y, dbh, kind in columns
+    ]
     for row, content in zip(rows[len(rows) - len(annotations) :], annotations, strict=True):
         row.update(annotated=True, taped=content.dbh is not None)
     return {"trees": rows}

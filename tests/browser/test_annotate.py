@@ -1161,6 +1161,9 @@ def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_nam
     )
     assert len(rows(person)) == len(trees)
     assert rows(person)[0]["dbh_cm"] == 31.5
+    beside = f"x_m,y_m\n{trees[0]['x'] + 0.02},{trees[0]['y']}\n"
+    file.set_input_files({"name": "gnss.csv", "mimeType": "text/csv", "buffer": beside.encode()})
+    expect(hint).to_contain_text("1 row lies 0.020 m beside an annotation and counts as the same object")
     page.locator("#annotate-undo").click()
     expect(page.locator("#problem")).to_contain_text(f"Undone: DBH of tree {trees[0]['number']} set to 31.5")
     page.locator("#annotate-undo").click()

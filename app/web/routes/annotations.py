@@ -135,9 +135,11 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     """Add the rows of a CSV table, and the diameters that annotations lack, in one edit, see `import_plan`.
     Return the number of added annotations (`added`), of diameters added to others (`filled`), of rows that
     exist already as annotations or earlier in the table (`left_out`), and of rows that are left out because
-    they contradict an annotation (`differing`), with the first of these as text (`differences`); and the
-    counts of edits, see `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows,
-    409 as in `add`; then nothing is added. Without new rows and diameters there is no edit."""
+    they contradict an annotation (`differing`), with the first of these as text (`differences`); of rows that
+    are not exactly at the place of their annotation (`beside`), with the smallest and the largest distance
+    (`beside_m`); and the counts of edits, see `edited`. 422 if the table cannot be read, has a row out of
+    bounds or too many rows, 409 as in `add`; then nothing is added. Without new rows and diameters there is
+    no edit."""
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
     contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
@@ -150,6 +152,8 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
         "left_out": plan.repeated,
         "differing": len(plan.conflicts),
         "differences": [_difference(dashboard, *pair) for pair in plan.conflicts[:_MOST_NAMED]],
+        "beside": len(plan.beside),
+        "beside_m": [round(end(plan.beside), 3) for end in (min, max) if plan.beside],
     }
     return await edited(dashboard, body, payload)
 

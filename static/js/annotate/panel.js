@@ -3,7 +3,7 @@
 import { placeTexts, unitNode } from "../core/coordinates.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { fileName } from "../core/download.js";
-import { count, dbhText, figure, NONE, seenText } from "../core/format.js";
+import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { showNews } from "../core/problem.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
@@ -102,7 +102,7 @@ async function take(file, unit) {
   const confirmed = () => trees().filter((tree) => reviewOf(tree) === "confirmed").length, before = confirmed();
   const done = await importTable(await file.text(), unit);
   const more = confirmed() - before;
-  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
+  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
   if (done) showNews(imported);
   fill();
 }
@@ -111,6 +111,12 @@ function differingText({ differing, differences }) {
   if (!differing) return "";
   const more = differing - differences.length;
   return `; ${differing} ${differing === 1 ? "differs from its annotation and was" : "differ from their annotations and were"} left out: ${differences.join("; ")}${more ? `; and ${more} more` : ""}`;
+}
+
+function besideText({ beside, beside_m: [least, most] }) {
+  if (!beside) return "";
+  const gap = beside === 1 ? fixed(most, 3) : `${fixed(least, 3)} to ${fixed(most, 3)}`;
+  return `; ${count(beside, "row")} ${beside === 1 ? "lies" : "lie"} ${gap} m beside an annotation and ${beside === 1 ? "counts" : "count"} as the same object`;
 }
 
 function lineOf(row) {

@@ -263,6 +263,35 @@ async def test_an_imported_dbh_fills_the_annotation_and_is_undone_with_the_impor
     assert [row["dbh_cm"] for row in await rows(client)] == [None, None]
 
 
+async def test_a_row_beside_an_annotation_is_about_the_same_object(both: Running) -> None:
+    client, _ = both
+    await edit(client, "POST", x=0.0, y=0.0)
+    await edit(client, "POST", x=5.0, y=0.0, dbh_cm=30.0)
+    await edit(client, "POST", x=9.0, y=0.0, kind="pole")
+    table = "x_m,y_m,dbh_cm,class\n0.1,0,26,tree\n5.02,0,31,tree\n9,0.4,,tree\n12,0,,tree\n12.51,0,,tree\n"
+    answer = (await edit(client, "POST", "/import", table=table)).json()
+    assert (answer["added"], answer["filled"], answer["left_out"], answer["differing"]) == (2, 1, 0, 2)
+    assert (answer["beside"], answer["beside_m"]) == (3, [0.02, 0.4])
+    assert answer["differences"] == [
+        "the annotation at 5.00, 0.00 has DBH 30 cm here, 31 cm in the file",
+        "the annotation at 9.00, 0.00 is pole here, tree in the file",
+    ]
+    assert [(row["x"], row["dbh_cm"]) for row in await rows(client)][:2] == [(0.0, 26.0), (5.0, 30.0)]
+
+
+async def test_two_stems_of_a_table_stay_two(both: Running) -> None:
+    client, _ = both
+    await edit(client, "POST", x=0.1, y=0.0)
+    twins = "x_m,y_m,dbh_cm\n0.3,0,20\n0,0,30\n"  # the second one is nearer to the annotation
+    for added, left_out, beside in ((1, 0, 1), (0, 2, 1)):
+        answer = (await edit(client, "POST", "/import", table=twins)).json()
+        assert (answer["added"], answer["left_out"], answer["beside"]) == (added, left_out, beside)
+    known = [(row["x"], row["dbh_cm"]) for row in await rows(client)]
+    assert known == [(0.1, 30.0), (0.3, 20.0)]
+    more = (await edit(client, "POST", "/import", table="x_m,y_m,dbh_cm\n50,0,20\n50.3,0,30\n")).json()
+    assert more["added"] == 2
+
+
 async def test_a_saved_table_names_the_trees_of_the_map() -> None:
     async with running() as (client, dashboard):
         client.headers.update(BEARER)
