@@ -41,9 +41,10 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import csv_text, number_text
 from pipeline.seen_area import SeenArea
-from pipeline.types.records import Trees
+from pipeline.types.records import Bool, Trees
 
 ALL = "all"
+_MOST_NAMED = 3  # trees of one kind
 
 
 class PeopleCount(NamedTuple):
@@ -75,6 +76,8 @@ class StandResult:
             counts for it: `rejected` (in the review), `outside_of_plots` (only with plots),
             `outside_of_observed_area` or `below_minimum_dbh`, whichever comes first. A tree without a
             diameter is not below the minimum.
+        added_out_of_sight: Positions of the trees that people added and that do not count because they are
+            outside of the observed area, shape (M, 2) [m] in the frame of the map.
         detection: Probability of detection over distance.
         warnings: Messages, those of plots with the name of the plot.
     """
@@ -90,6 +93,7 @@ class StandResult:
     total: dict[str, Estimate]
     by_people: dict[str, PeopleCount]
     left_out: dict[str, int]
+    added_out_of_sight: Float
     detection: DetectionFunction
     warnings: tuple[str, ...]
 
@@ -155,10 +159,7 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     elif np.isfinite(trees.dbh).sum() >= 3 and np.nanmax(trees.dbh) < 0.02:
         warnings.append("all diameters are below 2 cm: is the column dbh_cm of trees.csv in metres?")
     total = combined(figures) if len(observed) > 1 else dict(observed[0].values)
-    left_out = {
-        "rejected": len(run.rejected.number),
-        **_left_out(trees, plots, seen, parameters.dbh_min),
-    }
+    left_out = _left_out(trees, plots, seen, parameters.dbh_min)
     rejected = PlotTrees(run.rejected.position, run.rejected.dbh, run.rejected.dbh_sigma)
     return StandResult(
         run,
@@ -171,7 +172,11 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         figures,
         total,
         {plot.name: _people_count(plot, trees, rejected, seen, parameters.dbh_min) for plot in chosen},
-        left_out,
+        {
+            "rejected": len(run.rejected.number),
+            **{reason: int(np.count_nonzero(applies)) for reason, applies in left_out.items()},
+        },
+        trees.position[left_out["outside_of_observed_area"] & ~trees.of_map],
         detection_function(trees, seen, parameters),
         tuple(warnings),
     )
@@ -179,10 +184,9 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
 
 def _left_out(
     trees: PlotTrees, plots: Sequence[SamplePlot], seen: SeenArea, dbh_min: float
-) -> dict[str, int]:
-    """Return a dict from each reason of `StandResult.left_out` except `rejected` to the number of trees that
-    no plot counts for it, each tree for the first reason only; without `outside_of_plots` if there are no
-    plots."""
+) -> dict[str, Bool]:
+    """Return a dict from each reason of `StandResult.left_out` except `rejected` to whether no plot counts
+    each tree for it, the first reason only; without `outside_of_plots` if there are no plots."""
     reasons = {
         "outside_of_observed_area": seen.rows(trees.position) < 0,
         "below_minimum_dbh": trees.dbh < dbh_min,
@@ -193,7 +197,7 @@ def _left_out(
     counted = np.ones(len(trees.dbh), np.bool_)
     result = {}
     for reason, applies in reasons.items():
-        result[reason] = int(np.count_nonzero(counted & applies))
+        result[reason] = counted & applies
         counted &= ~applies
     return result
 
@@ -318,6 +322,8 @@ def stand_record(result: StandResult) -> dict[str, Any]:
     - `parameters`: dict of the parameters of `Stand`;
     - `trees_in_map`: number of trees, with rejected ones; `trees_added`: number of trees that people added;
     `trees_left_out`: dict from a reason to the number of trees of either that no plot counts;
+    `added_out_of_sight`: list of [x, y] in the frame of the map [m] of the added ones that do not count
+    because they are outside of the observed area;
     - `detection_sigma_m`: None if detection does not decrease with distance or is not estimated;
     - `detection_not_estimated`: the reason, see `DetectionFunction`, "" if it is estimated;
     - `units`: dict from each stand parameter to its unit;
@@ -335,6 +341,7 @@ def stand_record(result: StandResult) -> dict[str, Any]:
         "trees_in_map": len(result.run.trees.number) + len(result.run.rejected.number),
         "trees_added": int(np.count_nonzero(~result.trees.of_map)),
         "trees_left_out": result.left_out,
+        "added_out_of_sight": result.added_out_of_sight.round(3).tolist(),
         "detection_sigma_m": _finite(result.detection.sigma),
         "detection_not_estimated": result.detection.reason,
         "units": {name: unit for name, (_, unit) in FIGURES.items()},
@@ -391,8 +398,9 @@ def _numbers(values: Sequence[float]) -> list[str]:
 
 def stand_summary(result: StandResult) -> list[str]:
     """Return the stand parameters over all observed plots as lines for people: their trees and area, trees
-    that are not counted and what people changed if there are any, the stand parameters that have a value,
-    detection, and the meaning of the standard errors. Warnings are not included."""
+    that are not counted, with the places of added ones, and what people changed if there are any, the stand
+    parameters that have a value, detection, and the meaning of the standard errors. Warnings are not
+    included."""
     observed = [f for f in result.figures.values() if f.seen > 0.0]
     seen, area = sum(f.seen for f in observed), sum(f.area for f in observed)
     trees = sum(f.trees for f in observed)
@@ -406,6 +414,12 @@ def stand_summary(result: StandResult) -> list[str]:
     ]
     if left_out:
         lines.append(f"trees that are not counted: {left_out}")
+    if len(result.added_out_of_sight):
+        places = result.frame.to_crs(result.added_out_of_sight).tolist()
+        named = [f"{x:.2f}, {y:.2f}" for x, y in places[:_MOST_NAMED]]
+        if more := len(places) - len(named):
+            named.append(f"and {more} more")
+        lines.append(f"added by people outside of the observed area, not counted: {'; '.join(named)}")
     for name, counted in result.by_people.items():
         if words := people_words(counted):
             lines.append(f"by people{'' if result.whole else f', plot {name}'}: {words}")

@@ -123,7 +123,12 @@ def test_what_people_measured_is_stated_below_the_figures(person: Dashboard) -> 
     expect(review).to_have_text(
         re.compile(r"Review: 1 of .*\(1 confirmed\)\. By people: 1 diameter by tape\.$")
     )
-    person.page.evaluate(send, ["/api/annotations/undo", {**signed, "subjects": ["tree"]}])
+    far = {"x": 500.0, "y": 1.5, "kind": "tree"}
+    person.page.evaluate(send, ["/api/annotations", {**signed, **far}])
+    unseen = "Added by people outside the observed area: 500.000, 1.500 m."
+    expect(person.page.locator("#plots-hint")).to_contain_text(unseen)
+    for _ in range(2):
+        person.page.evaluate(send, ["/api/annotations/undo", {**signed, "subjects": ["tree"]}])
     expect(review).to_have_text(re.compile(r"Review: 0 of \d+ found trees reviewed\.$"))
 
 

@@ -2,7 +2,7 @@
 
 import { draft, historyOf, remove, reviewOf, STATES } from "../../annotate/annotations.js";
 import { get } from "../../core/api.js";
-import { inFile, inMap, unitNode } from "../../core/coordinates.js";
+import { inFile, inMap, placeText, unitNode } from "../../core/coordinates.js";
 import { button, byId, el, recall, remember, setText } from "../../core/dom.js";
 import { nothingYet } from "../../core/empty_state.js";
 import { count, figure, percent, plusMinus, withSigma } from "../../core/format.js";
@@ -18,6 +18,7 @@ import { reportMenu } from "./report.js";
 
 const pause = () => (state.status?.state === "playing" ? 3000 : 300); // [ms] between two requests
 const { undo, redo, canUndo, canRedo } = historyOf("other");
+const MOST_NAMED = 3; // added trees that do not count
 const LARGEST_FILES = 700_000; // [bytes]
 // name, label, value and bounds of the numbers of a shape; those of the server
 const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],
@@ -195,12 +196,18 @@ function hint() {
   if (drawing()) return `Drag on the map from ${sketch.kind === "circle" ? "the centre outwards" : "corner to corner"}, or click both ends. Esc ends.${sketch.kind === "circle" ? " Then its radius can be typed in the list." : ""}`;
   if (!state.map) return nothingYet();
   const drawn = plots().length > 0;
-  const { trees_in_map: found, trees_added: added, trees_left_out: leftOut = {} } = (drawn ? figures.plots : figures.all) ?? {};
+  const { trees_in_map: found, trees_added: added, trees_left_out: leftOut = {}, added_out_of_sight: unseen = [] } = (drawn ? figures.plots : figures.all) ?? {};
   const all = found + added;
   const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
-  const trees = found === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${count(all, "tree")} are counted.`}`;
+  const trees = found === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${count(all, "tree")} are counted.`}${outOfSightText(unseen)}`;
   if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
   return `Trees of the map at the shown time.${trees} ± is the standard error; false trees, and trees that neither the map nor people have, are not included. For the mean it is the variation between plots, at least the error of the plots.`;
+}
+
+function outOfSightText(places) {
+  if (!places.length) return "";
+  const named = places.slice(0, MOST_NAMED).map(placeText), more = places.length - named.length;
+  return ` Added by people outside the observed area: ${[...named, ...(more ? [`and ${more} more`] : [])].join("; ")}.`;
 }
 
 const UNKNOWN_ERROR = " The error of the stems is not known where all of the area was observed and no diameter is near the minimum: only trees that were not found could change the number.";

@@ -88,6 +88,13 @@ def test_an_added_tree_out_of_sight_is_listed(run):
     }
     assert result.by_people == {"all": (0, 0, 0)}
     assert result.figures["all"].trees == 100
+    assert record["added_out_of_sight"] == [[90.0, 2.0]]
+    many = figures_of_stated(run, [Content(90.0 + k, 2.0) for k in range(5)])
+    named = "90.00, 2.00; 91.00, 2.00; 92.00, 2.00; and 2 more"
+    told = [line for line in stand_summary(many) if line.startswith("added by people outside")]
+    assert told == [f"added by people outside of the observed area, not counted: {named}"]
+    # Outside of the plots, too, it is listed as such.
+    assert len(figures_of_stated(run, [Content(90.0, 2.0)], plots=[WEST]).added_out_of_sight) == 0
 
 
 def test_a_thin_tree_by_tape_does_not_count(run):
