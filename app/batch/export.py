@@ -32,7 +32,7 @@ from app.batch.map_frame import (
     read_map_frame,
     reproject,
 )
-from app.batch.run_folder import read_by_people, read_run, read_terrain
+from app.batch.run_folder import counted_dbh, read_by_people, read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import ROBOTS_FRAME, features_text, point_feature, tree_features
@@ -59,6 +59,12 @@ class Field:
     meaning: str
 
 
+_COUNTED = (
+    Field("dbh_counted_cm", "dbh_count", "cm", "diameter that counts: by tape, else of the map"),
+    Field(
+        "dbh_source", "dbh_source", "", "source of the diameter that counts: tape or map; empty without one"
+    ),
+)
 TREE_FIELDS = (
     Field("tree", "tree", "", "number of the tree in the map"),
     Field("dbh_cm", "dbh_cm", "cm", "diameter at breast height"),
@@ -88,6 +94,7 @@ TREE_FIELDS = (
     Field("lean_deg", "lean_deg", "deg", "angle of the stem from the vertical"),
     Field("review", "review", "", "state of the review: open, or confirmed or skipped by a person"),
     Field("dbh_tape_cm", "dbh_tape", "cm", "diameter that a person measured by tape; empty without one"),
+    *_COUNTED,
 )
 #: Fields of each layer.
 LAYER_FIELDS = {
@@ -96,7 +103,10 @@ LAYER_FIELDS = {
         Field("scans", "scans", "", "number of scans"),
         Field("length_m", "length_m", "m", "length of the path"),
     ),
-    "added": (Field("dbh_tape_cm", "dbh_tape", "cm", "diameter by tape of a tree that a person added"),),
+    "added": (
+        Field("dbh_tape_cm", "dbh_tape", "cm", "diameter by tape of a tree that a person added"),
+        *_COUNTED,
+    ),
 }
 
 
@@ -110,7 +120,7 @@ class ExportedRun:
         frame: Reference system of the run.
         place: Positions of the trees: east, north, or x, y for a local map, shape (T, 2) [m].
         columns: Dict from each name of TREE_FIELDS to the rounded values of the trees, shape (T,); NaN for
-            unknown values. `review` has texts.
+            unknown values. `review` and `dbh_source` have texts.
         path: The path in the coordinates of `place`, shape (N, 2) [m].
         terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
         added: Trees that a person added because the map lacks them, in the coordinates of `place`, shape
@@ -127,6 +137,12 @@ class ExportedRun:
     terrain: Float
     added: Float
     added_dbh: Float
+
+    @property
+    def added_columns(self) -> dict[str, Any]:
+        """Dict from each name of the fields of the layer `added` to the values of these trees."""
+        counted = counted_dbh(self.added_dbh, np.full(len(self.added), np.nan))
+        return dict(zip((f.name for f in LAYER_FIELDS["added"]), (self.added_dbh, *counted), strict=True))
 
     @property
     def crs(self) -> str:
@@ -153,6 +169,8 @@ def read_for_export(folder: FilePath) -> ExportedRun:
     ground = heights_at(terrain, trees.position) + frame.z
     unknown = np.full(len(trees.number), np.nan)
     people = read_by_people(folder)
+    tape = people.tape_of(trees.number.tolist())
+    counted, source = counted_dbh(tape, trees.dbh)
     values = (
         trees.number,
         100.0 * trees.dbh,
@@ -170,9 +188,11 @@ def read_for_export(folder: FilePath) -> ExportedRun:
         unknown if trees.height_sigma is None else trees.height_sigma,
         unknown if trees.lean is None else np.degrees(trees.lean),
         np.array(list(run.reviews.values()), np.str_),
-        100.0 * np.array([people.tape.get(number, math.nan) for number in trees.number.tolist()], np.float64),
+        100.0 * tape,
+        100.0 * counted,
+        source,
     )
-    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0, 1)
+    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0, 1, 1, 0)
     columns = {
         field.name: np.round(v, d) if v.dtype.kind == "f" else v
         for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)
@@ -258,7 +278,7 @@ def layers_of(run: ExportedRun) -> dict[str, Any]:
         )
     if len(run.added):
         layers["added"] = geopandas.GeoDataFrame(
-            {"dbh_tape_cm": run.added_dbh}, geometry=shapely.points(run.added), crs=run.crs
+            run.added_columns, geometry=shapely.points(run.added), crs=run.crs
         )
     return layers
 
@@ -357,17 +377,20 @@ STYLES = {
 
 def trees_geojson(run: ExportedRun) -> str:
     """Return the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map. Where
-    people measured any, the trees have `dbh_tape_cm`, and those that they added follow, with the review
-    "added" and without a number."""
+    people measured any, the trees have `dbh_tape_cm`, `dbh_counted_cm` and `dbh_source`, and those that they
+    added follow, with the review "added" and without a number."""
     lon_lat = reproject(run.place, run.frame.crs, WGS84) if run.frame.crs else None
     reviews = dict(zip(run.columns["tree"].tolist(), run.columns["review"].tolist(), strict=True))
     features = tree_features(run.trees, 0, lon_lat=lon_lat, reviews=reviews)
-    tape = [*run.columns["dbh_tape_cm"].tolist(), *run.added_dbh.tolist()]
     places = reproject(run.added, run.frame.crs, WGS84).round(8) if run.frame.crs else run.added.round(3)
     features += [point_feature(x, y, {"tree": None, "review": "added"}) for x, y in places.tolist()]
-    if len(run.added) or np.isfinite(tape).any():
-        for feature, dbh in zip(features, tape, strict=True):
-            feature["properties"]["dbh_tape_cm"] = dbh if math.isfinite(dbh) else None
+    if len(run.added) or np.isfinite(run.columns["dbh_tape_cm"]).any():
+        for name, of_added in run.added_columns.items():
+            for feature, value in zip(
+                features, [*run.columns[name].tolist(), *of_added.tolist()], strict=True
+            ):
+                is_known = value if isinstance(value, str) else math.isfinite(value)
+                feature["properties"][name] = value if is_known else None
     return features_text(features, None if run.frame.crs else ROBOTS_FRAME)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config import Parameters
 from pipeline.config.model import validated
@@ -96,6 +97,23 @@ class ByPeople:
     tape: dict[int, float]
     added: Float
     added_dbh: Float
+
+    def tape_of(self, numbers: Sequence[int]) -> Float:
+        """Return the diameter by tape of each tree by its number [m]; NaN where there is none."""
+        return np.array([self.tape.get(number, math.nan) for number in numbers], np.float64)
+
+
+def counted_dbh(tape: Float, of_map: Float) -> tuple[Float, NDArray[np.str_]]:
+    """Return the diameter of each tree that counts, and its source: "tape", else "map", "" where it is
+    unknown.
+
+    Args:
+        tape: Diameters by tape, shape (T,); NaN where unknown.
+        of_map: Those of the map, likewise.
+    """
+    by_tape = np.isfinite(tape)
+    source = np.where(by_tape, "tape", np.where(np.isfinite(of_map), "map", ""))
+    return np.where(by_tape, tape, of_map), source
 
 
 def read_run(folder: FilePath) -> FinishedRun:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -15,7 +14,7 @@ import numpy as np
 
 from app.batch.map_frame import write_map_frame
 from app.batch.run_edits import by_people_text, measured_by_people, reviews_of
-from app.batch.run_folder import ByPeople, as_written, recorded_time, score_map
+from app.batch.run_folder import ByPeople, as_written, counted_dbh, recorded_time, score_map
 from app.batch.summary import far_truth, left_out_warning, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
@@ -143,14 +142,17 @@ class ShownRun:
 
     def trees_text(self, people: ByPeople) -> str:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
-        coordinates of the files; where any was measured by tape, with `dbh_tape_cm`; with a reference system
-        also their `easting_m` and `northing_m` in it. `people` is the result of `by_people`."""
+        coordinates of the files; where any was measured by tape, with `dbh_tape_cm`, `dbh_counted_cm` and
+        `dbh_source`, see `counted_dbh`; with a reference system also their `easting_m` and `northing_m` in
+        it. `people` is the result of `by_people`."""
         trees = in_file(self.shown.frame.trees, self.one_step)
         names, rows = TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())
         if people.tape:
-            names = (*names, "dbh_tape_cm")
-            known = (people.tape.get(number, math.nan) for number in self._numbered()[0])
-            rows = [(*row, number_text(100.0 * dbh, 1)) for row, dbh in zip(rows, known, strict=True)]
+            names = (*names, "dbh_tape_cm", "dbh_counted_cm", "dbh_source")
+            tape = people.tape_of(self._numbered()[0])
+            counted, source = counted_dbh(tape, trees.dbh[trees.confirmed])
+            texts = ([number_text(100.0 * dbh, 1) for dbh in column] for column in (tape, counted))
+            rows = [(*row, *more) for row, *more in zip(rows, *texts, source.tolist(), strict=True)]
         if self.frame is not None and self.frame.content.values is not None:
             given = self.frame.content.values["frame"]
             pose = Pose2(given["east_m"], given["north_m"], given["turn_rad"])

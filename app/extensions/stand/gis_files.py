@@ -245,7 +245,7 @@ def _write_xlsx(run: PlottedRun, file: FilePath) -> None:
     _sheet(book, "trees", {"tree": number, **place, **run.columns}, bold)
     if len(run.added):
         added = {name: np.round(run.added[:, axis], 3) for axis, name in enumerate((first, second))}
-        _sheet(book, "added", {**added, "dbh_tape_cm": run.added_dbh}, bold)
+        _sheet(book, "added", {**added, **run.added_columns}, bold)
     if run.plots:
         _sheet(book, "plots", _plot_table(run), bold)
     axes = tuple(Field(name, "", "m", f"coordinate in {run.frame.name}") for name in (first, second))

@@ -14,7 +14,14 @@ import shapely
 
 from app.batch.map_frame import MapFrame, read_map_frame
 from app.batch.run_edits import TAPE_SIGMA
-from app.batch.run_folder import ByPeople, FinishedRun, read_by_people, read_run, read_seen_area
+from app.batch.run_folder import (
+    ByPeople,
+    FinishedRun,
+    counted_dbh,
+    read_by_people,
+    read_run,
+    read_seen_area,
+)
 from app.common.text import count, version
 from app.extensions.stand.figures import (
     FEW_TREES,
@@ -234,9 +241,7 @@ def counted_trees(trees: Trees, people: ByPeople, parameters: Stand) -> PlotTree
     Raises:
         StemmapError: The formula is not valid.
     """
-    tape = np.concatenate(
-        [[people.tape.get(number, math.nan) for number in trees.number.tolist()], people.added_dbh]
-    )
+    tape = np.concatenate([people.tape_of(trees.number.tolist()), people.added_dbh])
     by_tape, unknown = np.isfinite(tape), np.full(len(people.added), np.nan)
 
     def with_added(column: Float | None) -> Float:
@@ -245,7 +250,7 @@ def counted_trees(trees: Trees, people: ByPeople, parameters: Stand) -> PlotTree
 
     counted = PlotTrees(
         np.concatenate([trees.position, people.added]),
-        np.where(by_tape, tape, with_added(trees.dbh)),
+        counted_dbh(tape, with_added(trees.dbh))[0],
         np.where(by_tape, TAPE_SIGMA, with_added(trees.dbh_sigma)),
         height=with_added(trees.height),
         by_tape=by_tape,

@@ -80,9 +80,15 @@ def test_what_people_measured_is_exported_beside_the_map(tmp_path):
             assert len(read_for_export(again).added) == 0
     assert np.flatnonzero(np.isfinite(run.columns["dbh_tape_cm"])).tolist() == [4]
     assert (run.columns["dbh_tape_cm"][4], run.columns["dbh_cm"][4]) == (23.4, 20.0)
+    assert run.columns["dbh_counted_cm"][3:5].tolist() == [20.0, 23.4]
+    assert run.columns["dbh_source"][3:5].tolist() == ["map", "tape"]
     np.testing.assert_allclose(run.added, [[2.0, 2.0], [4.0, 2.0]])
     np.testing.assert_array_equal(run.added_dbh, [31.0, np.nan])
     assert [feature["properties"]["dbh_tape_cm"] for feature in features[3:5]] == [None, 23.4]
+    counted = [
+        (of["dbh_counted_cm"], of["dbh_source"]) for of in (features[k]["properties"] for k in (3, 4, -2, -1))
+    ]
+    assert counted == [(20.0, "map"), (23.4, "tape"), (31.0, "tape"), (None, None)]
     assert [feature["properties"]["review"] for feature in features[-3:]] == ["open", "added", "added"]
     assert features[-2]["geometry"]["coordinates"] == [2.0, 2.0]
 

@@ -149,18 +149,27 @@ def test_what_people_measured_is_in_every_format(tmp_path, capsys):
     files = {suffix: tmp_path / f"trees.{suffix}" for suffix in ("gpkg", "shp", "xlsx", "dxf", "geojson")}
     for file in files.values():
         assert stemmap(capsys, "export", run, "--to", file).code == 0
-    for part, layer, name in (
-        (files["gpkg"], "added", "dbh_tape_cm"),
-        (tmp_path / "trees_added.shp", None, "dbh_tape"),
+    for part, layer, *names in (
+        (files["gpkg"], "added", "dbh_tape_cm", "dbh_counted_cm", "dbh_source"),
+        (tmp_path / "trees_added.shp", None, "dbh_tape", "dbh_count", "dbh_source"),
     ):
         with fiona.open(part, layer=layer) as table:
-            rows = [(row.geometry.coordinates[0], row.properties[name]) for row in table]
-        assert rows == [(pytest.approx(500002.0), 31.0), (pytest.approx(500004.0), None)]
+            rows = [[row.geometry.coordinates[0], *(row.properties[name] for name in names)] for row in table]
+        assert rows[0] == [pytest.approx(500002.0), 31.0, 31.0, "tape"]
+        assert rows[1][:3] == [pytest.approx(500004.0), None, None]
+        assert not rows[1][3]
     with fiona.open(files["gpkg"], layer="trees") as table:
         tape = {row.properties["tree"]: row.properties["dbh_tape_cm"] for row in table}
     assert {number: dbh for number, dbh in tape.items() if dbh is not None} == {5: 23.4}
     book = openpyxl.load_workbook(files["xlsx"])
-    assert list(book["added"].values)[:2] == [("east_m", "north_m", "dbh_tape_cm"), (500002, 5300002, 31)]
+    assert list(book["added"].values)[:2] == [
+        ("east_m", "north_m", "dbh_tape_cm", "dbh_counted_cm", "dbh_source"),
+        (500002, 5300002, 31, 31, "tape"),
+    ]
+    header, *rows = book["trees"].values
+    counted = [dict(zip(header, row, strict=True)) for row in rows]
+    assert {(of["dbh_counted_cm"], of["dbh_source"]) for of in counted if of["tree"] == 5} == {(23.4, "tape")}
+    assert {of["dbh_source"] for of in counted if of["tree"] != 5} == {"map"}
     assert "ADDED" in files["dxf"].read_text()
     assert len(json.loads(files["geojson"].read_text())["features"]) == 102
     figures = stemmap(capsys, "stand", run).out
