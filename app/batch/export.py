@@ -69,7 +69,7 @@ TREE_FIELDS = (
     Field("tree", "tree", "", "number of the tree in the map"),
     Field("dbh_cm", "dbh_cm", "cm", "diameter at breast height"),
     Field("sigma_dbh_cm", "sdbh_cm", "cm", "standard deviation of the diameter"),
-    Field("g_m2", "g_m2", "m2", "basal area"),
+    Field("g_m2", "g_m2", "m2", "basal area by the diameter that counts"),
     Field("sigma_x_m", "sx_m", "m", "standard deviation of the position along x of the map"),
     Field("sigma_y_m", "sy_m", "m", "standard deviation of the position along y of the map"),
     Field("z_m", "z_m", "m", "height of the ground at the tree"),
@@ -175,7 +175,7 @@ def read_for_export(folder: FilePath) -> ExportedRun:
         trees.number,
         100.0 * trees.dbh,
         100.0 * trees.dbh_sigma,
-        0.25 * math.pi * np.square(trees.dbh),
+        0.25 * math.pi * np.square(counted),
         np.sqrt(trees.covariance[:, 0, 0]),
         np.sqrt(trees.covariance[:, 1, 1]),
         ground,
@@ -353,11 +353,11 @@ def qml(kind: str, symbol: str, layer: str, properties: dict[str, str]) -> str:
 _BY_DBH = (
     '<data_defined_properties><Option type="Map"><Option name="properties" type="Map">'
     '<Option name="size" type="Map"><Option name="active" type="bool" value="true"/>'
-    '<Option name="expression" type="QString" value="coalesce(&quot;dbh_cm&quot; / 100, 0.1)"/>'
+    '<Option name="expression" type="QString" value="coalesce(&quot;dbh_counted_cm&quot; / 100, 0.1)"/>'
     '<Option name="type" type="int" value="3"/></Option></Option>'
     '<Option name="type" type="QString" value="collection"/></Option></data_defined_properties>'
 )
-#: Styles of the layers: trees are circles with their diameter in metres on the map.
+#: Styles of the layers: trees are circles with the diameter that counts, in metres on the map.
 STYLES = {
     "trees": qml(
         "marker",

@@ -203,7 +203,7 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
         columns = run.columns
         for k, (x, y) in enumerate(run.place.tolist()):
             z = float(np.nan_to_num(columns["z_m"][k]))
-            dbh = float(columns["dbh_cm"][k])
+            dbh = float(columns["dbh_counted_cm"][k])
             space.add_point((x, y, z), dxfattribs={"layer": "TREES"})
             if math.isfinite(dbh):
                 space.add_circle((x, y, z), 0.005 * dbh, dxfattribs={"layer": "TREES"})

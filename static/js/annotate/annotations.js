@@ -583,7 +583,7 @@ export function startAnnotating() {
   on("annotations map selection", keepOneSelection);
   on("selection", forgetTreeBefore);
   on("tab", () => {
-    state.keepsSelection = annotating();
+    state.keepsSelection = annotating() || visible("repair");
     if (annotating()) showCard();
   });
   on("remapped", () => { votes = NO_VOTES; }); // numbers may belong to other trees now

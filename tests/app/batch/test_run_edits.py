@@ -81,6 +81,7 @@ def test_what_people_measured_is_exported_beside_the_map(tmp_path):
     assert np.flatnonzero(np.isfinite(run.columns["dbh_tape_cm"])).tolist() == [4]
     assert (run.columns["dbh_tape_cm"][4], run.columns["dbh_cm"][4]) == (23.4, 20.0)
     assert run.columns["dbh_counted_cm"][3:5].tolist() == [20.0, 23.4]
+    assert run.columns["g_m2"][3:5] == pytest.approx(np.pi / 4 * np.square([0.2, 0.234]), abs=5e-5)
     assert run.columns["dbh_source"][3:5].tolist() == ["map", "tape"]
     np.testing.assert_allclose(run.added, [[2.0, 2.0], [4.0, 2.0]])
     np.testing.assert_array_equal(run.added_dbh, [31.0, np.nan])
