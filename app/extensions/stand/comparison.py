@@ -12,7 +12,8 @@ import numpy as np
 import shapely
 
 from app.batch.map_frame import WGS84, MapFrame, read_map_frame, reproject
-from app.batch.run_folder import read_run, read_seen_area
+from app.batch.run_edits import TAPE_SIGMA
+from app.batch.run_folder import counted_dbh, read_by_people, read_run, read_seen_area
 from app.batch.visits import (
     VisitComparison,
     VisitTrees,
@@ -115,8 +116,9 @@ def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tu
 
 def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: bool = False) -> Visit:
     """Return the visit of a run folder or of a table of trees (CSV). Rejected trees of a run, and objects in
-    a table that are not trees, are left out. Trees of a table have the sigma TABLE_SIGMA and a local frame;
-    the observed area of a run is that within the default reach of stand figures.
+    a table that are not trees, are left out. A diameter by tape takes the place of that of the map. Trees of
+    a table have the sigma TABLE_SIGMA and a local frame; the observed area of a run is that within the
+    default reach of stand figures.
 
     Args:
         path: The folder or the table.
@@ -131,7 +133,9 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
         trees = run.trees
         seen = None if recorded is None else within_reach(recorded.clear_cells(), Stand())
         sigma = np.sqrt(0.5 * np.trace(trees.covariance, axis1=1, axis2=2))
-        found = VisitTrees(trees.number, trees.position, sigma, trees.dbh, trees.dbh_sigma)
+        tape = read_by_people(path).tape_of(trees.number.tolist())
+        dbh_sigma = np.where(np.isfinite(tape), TAPE_SIGMA, trees.dbh_sigma)
+        found = VisitTrees(trees.number, trees.position, sigma, counted_dbh(tape, trees.dbh)[0], dbh_sigma)
         visit = Visit(str(path), found, run.rejected.position, seen, read_map_frame(path))
     else:
         table = read_truth_trees(path, dbh_unit=dbh_unit)

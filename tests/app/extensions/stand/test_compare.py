@@ -11,11 +11,13 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
+from app.batch.run_edits import TAPE_SIGMA, reviewed_run
 from app.batch.run_folder import read_run
 from app.batch.visits import VisitTrees, compare_visits
 from app.extensions.stand.comparison import read_visit
+from app.store.records import Content
 from pipeline.geometry.poses import Pose2
-from tests.app.batch.finished_runs import write_run
+from tests.app.batch.finished_runs import grid_run, write_run
 from tests.app.cli.test_commands import stemmap
 
 ELSEWHERE = Pose2(12.0, 5.0, 2.1)  # the frame of the first visit in that of the second
@@ -130,6 +132,17 @@ def test_the_same_run_twice_has_no_change(visits, tmp_path, capsys):
     assert "60 same" in result.out
     assert "significant for 0" in result.out
     assert {row["significant"] for row in rows(tmp_path / "out")} == {"false"}
+
+
+def test_a_diameter_by_tape_takes_the_place_of_that_of_the_map(tmp_path):
+    folder = grid_run(tmp_path / "run")
+    (x, y), before = read_run(folder).trees.position[4].tolist(), read_visit(folder).trees
+    with reviewed_run(folder, [Content(x, y, "tree", 0.234)]) as reviewed:
+        trees = read_visit(reviewed).trees
+    assert (trees.dbh[4], trees.dbh_sigma[4]) == pytest.approx((0.234, TAPE_SIGMA))
+    others = np.arange(len(trees.dbh)) != 4
+    np.testing.assert_array_equal(trees.dbh[others], before.dbh[others])
+    np.testing.assert_array_equal(trees.dbh_sigma[others], before.dbh_sigma[others])
 
 
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
