@@ -19,7 +19,7 @@ from pipeline.types.records import Float32, Int, Int32
 
 CELL = 0.25  # m; side of a voxel, the resolution of all rules here
 CUT = 0.03  # share of the columns of voxels that end in the uppermost one where the cloud is cut off
-TIP = 10  # highest points of a tree, from which their mean distance is estimated
+TIP = 10  # highest points of a tree, from whose gaps the error of its top is estimated
 FOOT_CELLS = 4  # cells of the ground that the foot of a stem covers at most
 GROUND_SIGMA = 0.05  # m; of the height of visible ground
 ABRUPT = 0.05  # m; a stem that is thicker at the highest point of the tree ends out of sight
@@ -91,9 +91,10 @@ def find_crowns(voxels: Voxels, stems: Stems, ground: TerrainRaster) -> Crowns:
 
     The height is that of the highest point of the tree. It is not seen (NaN, with the reason) if the ground
     at the stem is not seen, the tree has fewer than TIP points, the stem ends abruptly, the top may be cut by
-    the border or the upper end of the cloud, something else rises above it, or the highest returns are far
-    apart. The standard deviation combines the height of the ground, the thinning, and the mean distance
-    between the highest returns, by which the top can be missed.
+    the border or the upper end of the cloud, something else rises above it, returns above the tree are
+    connected with no stem, or the highest returns are far apart. The standard deviation combines the height
+    of the ground, the thinning, and the largest gap between the heights of the TIP highest points, by which
+    the top can be missed.
 
     Args:
         voxels: The cloud.
@@ -111,6 +112,7 @@ def find_crowns(voxels: Voxels, stems: Stems, ground: TerrainRaster) -> Crowns:
     sees_ground = ground.cells_seen_around(foot) > FOOT_CELLS
     ends = [_cut_off(points, column) for column in (2, 3)]
     low, high = points[:, :2].min(axis=0) + 2.0 * CELL, points[:, :2].max(axis=0) - 2.0 * CELL
+    loose = _highest_loose(points, tree, len(stems))
     hidden = []
     for k, stem in enumerate(stems):
         rows = np.flatnonzero(tree == k)
@@ -122,7 +124,7 @@ def find_crowns(voxels: Voxels, stems: Stems, ground: TerrainRaster) -> Crowns:
             hidden.append("too few points above the stem")
             continue
         top = points[tip[0]]
-        apart = (top[2] - points[tip[-1], 2]) / (TIP - 1)
+        gap = float(np.diff(points[tip[::-1], 2]).max())
         over = (np.hypot(*(points[:, :2] - top[:2]).T) < 2.0 * CELL) & (points[:, 2] > top[2] + 0.5 * CELL)
         radius = stem["radius"] + stem["taper"] * (stem["last"] - BREAST)
         if top[2] - z0[k] < stem["last"] + 4.0 * CELL and radius > ABRUPT:
@@ -133,12 +135,14 @@ def find_crowns(voxels: Voxels, stems: Stems, ground: TerrainRaster) -> Crowns:
             hidden.append("its top is at the border of the plot")
         elif (over & (tree != k)).any():
             hidden.append("another crown continues above its top")
-        elif apart > 2.0 * CELL:
+        elif loose[k] > top[2] + 0.5 * CELL:
+            hidden.append("returns above its top are not connected with it")
+        elif gap > 2.0 * CELL:
             hidden.append("there are too few returns at its top")
         else:
             hidden.append("")
             height[k] = top[2] - z0[k]
-            sigma[k] = np.sqrt(GROUND_SIGMA**2 + voxels.side**2 / 12.0 + apart**2)
+            sigma[k] = np.sqrt(GROUND_SIGMA**2 + voxels.side**2 / 12.0 + gap**2)
     return Crowns(tree, height, sigma, tuple(hidden))
 
 
@@ -176,6 +180,20 @@ def _nearest_stems(voxels: Voxels, stems: Stems) -> Int32:
         reached = np.isfinite(distance)
         owner[reached] = owner[source[reached]]
     return owner[voxels.voxel]
+
+
+def _highest_loose(points: Float, tree: Int32, count: int) -> Float:
+    """Return for each tree the largest z [m] of the points of no tree whose nearest point of a tree is one of
+    it, less than two cells aside; -inf without any."""
+    from scipy.spatial import cKDTree
+
+    highest, known = np.full(count, -np.inf), np.flatnonzero(tree >= 0)
+    loose = np.flatnonzero((tree < 0) & (points[:, 3] > CELL))
+    if len(known) and len(loose):
+        nearest = known[cKDTree(points[known, :3]).query(points[loose, :3])[1]]
+        over = np.hypot(*(points[loose, :2] - points[nearest, :2]).T) < 2.0 * CELL
+        np.maximum.at(highest, tree[nearest[over]], points[loose[over], 2])
+    return highest
 
 
 def _cut_off(points: Float, column: int) -> float:

@@ -75,6 +75,7 @@ def test_each_point_of_two_crowns_belongs_to_its_tree():
     [
         ("cut off at its top", lambda points: points[points[:, 2] < 8.0]),
         ("another crown continues above", lambda points: np.vstack([points, roof()])),
+        ("not connected with it", lambda points: np.vstack([points, *broken_top()])),
         ("border of the plot", lambda points: points[points[:, 0] < 6.2]),
         ("ends abruptly", lambda points: np.vstack([points[~above_middle(points)], twigs()])),
         (
@@ -114,6 +115,24 @@ def roof():
     """A layer of leaves above the tree in the middle, one metre above its tip."""
     rng = np.random.default_rng(5)
     return rng.uniform((5.0, 5.0, TOP + 1.0), (7.0, 7.0, TOP + 1.5), (3000, 3))
+
+
+def broken_top():
+    """Broad branches of the tree in the middle, and its top aside of its stem, above a gap."""
+    rng = np.random.default_rng(9)
+    branches = rng.uniform((4.8, 4.8, TOP - 1.5), (7.2, 7.2, TOP - 0.5), (6000, 3))
+    return branches, rng.uniform((6.8, 5.8, TOP + 0.3), (7.2, 6.2, TOP + 0.8), (50, 3))
+
+
+@pytest.mark.parametrize("gap", [0.2, 0.45])
+def test_the_sigma_of_a_height_contains_the_largest_gap_between_the_highest_returns(gap):
+    rng = np.random.default_rng(10)
+    single = [[4.0, 4.0, TOP + gap]]
+    m = mapped([flat(8.0, rng), tree(4.0, 4.0, rng), single])
+    assert m.trees.height is not None
+    assert m.trees.height_sigma is not None
+    assert m.trees.height[0] == pytest.approx(TOP + gap, abs=0.05)
+    assert gap <= m.trees.height_sigma[0] < gap + 0.15
 
 
 def test_steps_report_progress_and_may_be_left_and_begun_again():
