@@ -234,13 +234,13 @@ def stand_figures(
     share = min(seen / area, 1.0)
     common = parameters.dbh_shared_sigma
     basal, basal_var = _basal_areas(kept, common)
-    unsure = _threshold_variance(trees, parameters.dbh_min, common)
+    unsure = _variance_of_number(trees, parameters.dbh_min, math.inf, common)
     found = kept.of_map
     lacking = _lacking(found, p)
     standing = np.where(found, 1.0 + lacking / max(int(found.sum()), 1), 1.0)
     totals = [
         ("n_ha", np.ones(n), unsure),
-        ("g_ha", basal, basal_var + unsure * _least_basal(parameters) ** 2),
+        ("g_ha", basal, basal_var + unsure * _basal_area(parameters.dbh_min) ** 2),
     ]
     if kept.volume is not None and kept.volume_sigma is not None and (volumes or not n):
         totals.append(("v_ha", *_volumes(kept.volume, kept.volume_sigma, kept.volume_shared, basal)))
@@ -271,7 +271,7 @@ def stand_figures(
         )
         values = _without_errors(values, _OF_DIAMETERS)
     values.update(_pattern(kept.position, seen, perimeter))
-    classes = _classes(kept, share, seen, parameters, math.isnan(p_se))
+    classes = _as_known(_classes(kept, trees, share, seen, parameters), values)
     return StandFigures(
         area, seen, n, missing, heights, volumes, Estimate(p, p_se), values, classes, tuple(warnings)
     )
@@ -301,7 +301,8 @@ def compared_with_gaps(
         "are not known"
     )
     values = _without_errors(dict(figures.values))
-    return replace(figures, values=values, warnings=(*figures.warnings, text))
+    classes = _as_known(figures.classes, values)
+    return replace(figures, values=values, classes=classes, warnings=(*figures.warnings, text))
 
 
 _OF_AREA = ("n_ha", "g_ha", "v_ha", "n_ha_corrected", "g_ha_corrected", "v_ha_corrected")
@@ -313,6 +314,19 @@ _OF_DIAMETERS = (
 def _without_errors(values: dict[str, Estimate], names: Sequence[str] = _OF_AREA) -> dict[str, Estimate]:
     """Return figures without the standard errors of some, by default of stems, basal area and volume."""
     return values | {name: Estimate(values[name].value, math.nan) for name in names}
+
+
+def _as_known(classes: Sequence[DiameterClass], values: Mapping[str, Estimate]) -> tuple[DiameterClass, ...]:
+    """Return diameter classes without the standard errors of stems or basal area that are not known of the
+    whole plot."""
+    stems, basal = (math.isnan(values[name].se) for name in ("n_ha", "g_ha"))
+    return tuple(
+        each._replace(
+            n_ha=Estimate(each.n_ha.value) if stems else each.n_ha,
+            g_ha=Estimate(each.g_ha.value) if basal else each.g_ha,
+        )
+        for each in classes
+    )
 
 
 def _lacking(found: Bool, p: float) -> float:
@@ -364,8 +378,8 @@ def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
     return result
 
 
-def _least_basal(parameters: Stand) -> float:
-    return 0.25 * math.pi * parameters.dbh_min**2
+def _basal_area(dbh: float) -> float:
+    return 0.25 * math.pi * dbh**2
 
 
 def _variance_of_sum(sigma: Float, shared: Float) -> float:
@@ -421,17 +435,19 @@ def _volumes(volume: Float, sigma: Float, shared: Float | None, basal: Float) ->
     return np.where(known, volume, ratio * basal), variance
 
 
-def _threshold_variance(trees: PlotTrees, least: float, common: float) -> float:
-    """Return the variance of the number of trees above the diameter `least` [m] by the errors of diameters,
-    of which `common` [m] is shared; trees without a diameter or its standard deviation add nothing."""
+def _variance_of_number(trees: PlotTrees, low: float, high: float, common: float) -> float:
+    """Return the variance of the number of trees with diameters from `low` to `high` [m] by the errors of
+    diameters, of which `common` [m] is shared; trees without a diameter or its standard deviation add
+    nothing."""
     from scipy.stats import norm
 
     known = np.isfinite(trees.dbh) & (trees.dbh_sigma > 0.0)
     sigma, shared = trees.dbh_sigma[known], trees.shared(common)[known]
-    above = np.clip((trees.dbh[known] - least) / sigma, -FAR, FAR)
-    p = norm.cdf(above)
+    above, beyond = (np.clip((trees.dbh[known] - limit) / sigma, -FAR, FAR) for limit in (low, high))
+    p = norm.cdf(above) - norm.cdf(beyond)
     # Change of the expected number by the shared error.
-    return _variance_of_sum(np.sqrt(p * (1.0 - p)), norm.pdf(above) * shared / sigma)
+    slope = norm.pdf(above) - norm.pdf(beyond)
+    return _variance_of_sum(np.sqrt(p * (1.0 - p)), slope * shared / sigma)
 
 
 def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: Stand) -> dict[str, Estimate]:
@@ -521,39 +537,45 @@ def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estima
 
 
 def _classes(
-    trees: PlotTrees, share: float, seen: float, parameters: Stand, assumed: bool
-) -> tuple[DiameterClass, ...]:
+    trees: PlotTrees, every: PlotTrees, share: float, seen: float, parameters: Stand
+) -> list[DiameterClass]:
     """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
     included; none if no tree has a diameter. The first class begins at the minimum diameter, which makes it
-    narrower unless that is a multiple of the width. Trees without a diameter are left out; thinner ones than
-    the minimum count in the first class.
+    narrower unless that is a multiple of the width. Trees without a diameter are left out. The standard
+    errors contain the part of the plot out of sight and the errors of the diameters, by which trees belong to
+    another class.
 
     Args:
-        trees: Trees of the observed part.
+        trees: Trees of the observed part from the minimum diameter.
+        every: Trees of the observed part, also thinner ones, some of which may belong to the first class.
         share: Share of the plot that was observed.
         seen: Observed area [m^2].
         parameters: Minimum diameter and width of a class.
-        assumed: As for `_scaled`.
     """
     known = trees.where(np.isfinite(trees.dbh))
     if not len(known.dbh):
-        return ()
-    width = parameters.class_width
+        return []
+    width, common = parameters.class_width, parameters.dbh_shared_sigma
     first = math.floor(parameters.dbh_min / width + 1e-9)
     of = np.maximum(np.floor(known.dbh / width + 1e-9).astype(int), first)
     scale, rest = HECTARE / seen, 1.0 - share
     rows = []
     for k in range(first, int(of.max()) + 1):
-        basal, variance = _basal_areas(known.where(of == k), parameters.dbh_shared_sigma)
-        n = len(basal)
-        g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance)
+        low, high = max(k * width, parameters.dbh_min), (k + 1) * width
+        basal, variance = _basal_areas(known.where(of == k), common)
+        unsure = _variance_of_number(every, low, high, common)
+        n_se = math.sqrt(rest * len(basal) + unsure)
+        middle = _basal_area(0.5 * (low + high))
+        g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance + unsure * middle**2)
+        if rest > 0.0 and n_se <= NEGLIGIBLE:  # no tree, and nothing tells how many are out of sight
+            n_se = g_se = math.nan
         rows.append(
             DiameterClass(
-                round(100.0 * max(k * width, parameters.dbh_min), 6),
-                round(100.0 * (k + 1) * width, 6),
-                n,
-                _scaled(scale, float(n), math.sqrt(rest * n), assumed),
-                _scaled(scale, float(basal.sum()), g_se, assumed),
+                round(100.0 * low, 6),
+                round(100.0 * high, 6),
+                len(basal),
+                Estimate(scale * len(basal), scale * n_se),
+                Estimate(scale * float(basal.sum()), scale * g_se),
             )
         )
-    return tuple(rows)
+    return rows

@@ -106,6 +106,54 @@ def test_a_shared_error_moves_all_trees_across_the_minimum_diameter_together():
     assert np.std(found) == pytest.approx(np.sqrt(np.mean(np.square(told))), rel=0.15)
 
 
+@pytest.mark.parametrize("shared", [0.0, 0.005])
+def test_the_number_of_a_class_is_wrong_by_about_its_standard_error(shared):
+    """Diameters of drawn stands are measured with errors. The true number of a class differs from the counted
+    one by more than the stated error, because the stated one does not contain the mean shift of a tree near a
+    limit; for evenly distributed diameters this is a factor of sqrt(sqrt(2)) = 1.19 at a single limit."""
+    random = np.random.default_rng(6)
+    wrong, told = [], []
+    limits = Stand(dbh_min=0.08, dbh_shared_sigma=shared)
+    for _ in range(150):
+        true = random.uniform(0.02, 0.62, 150)
+        sigma = np.hypot(random.uniform(0.013, 0.027, 150), shared)
+        d = true + random.normal(0.0, shared) + random.normal(0.0, np.sqrt(sigma**2 - shared**2))
+        trees = PlotTrees(trees_of(d).position, d, sigma)
+        for each in figures(trees, area=1e4, limits=limits).classes:
+            if 8.0 <= each.low < 56.0:
+                inside = (100.0 * true >= each.low) & (100.0 * true < each.high)
+                wrong.append(each.n_ha.value - np.count_nonzero(inside))
+                told.append(each.n_ha.se)
+    ratio = math.sqrt(np.mean(np.square(wrong)) / np.mean(np.square(told)))
+    assert 1.0 < ratio < 1.35
+
+
+def test_the_error_of_a_class_is_not_known_where_that_of_all_stems_is_not():
+    d = np.linspace(0.18, 0.38, 40)
+    assumed = figures(trees_of(d, 0.02), detection=(1.0, math.nan), limits=INDEPENDENT)
+    assert math.isnan(assumed.values["n_ha"].se)
+    assert all(math.isnan(c.n_ha.se) and c.g_ha.se > 0.0 for c in assumed.classes)
+    corrected = figures(trees_of(d, 0.02), detection=(0.8, 0.05), limits=INDEPENDENT)
+    assert all(math.isnan(c.n_ha.se) for c in corrected.classes)
+    complete = figures(trees_of(d, 0.02))
+    assert all(c.n_ha.se > 0.0 for c in complete.classes)
+    partly = figures(trees_of(d, 0.02), area=2000.0, seen=1000.0, detection=(0.8, 0.05))
+    errors = [c.n_ha.se for c in partly.classes if c.trees]
+    assert np.all(errors > 10.0 * np.sqrt([0.5 * c.trees for c in partly.classes if c.trees]))
+    empty = figures(trees_of([0.2, 0.5], 0.001), area=2000.0, seen=1000.0).classes[6]
+    assert (empty.trees, empty.n_ha.value) == (0, 0.0)
+    assert math.isnan(empty.n_ha.se)
+    gaps = compared_with_gaps(partly, trees_of([0.3] * 200), 1500.0, Stand())
+    assert all(math.isnan(c.n_ha.se + c.g_ha.se) for c in gaps.classes)
+
+
+def test_trees_below_the_minimum_diameter_may_belong_to_the_first_class():
+    d = [0.3] * 10
+    alone, beside = (figures(trees_of([*d, *thin], 0.01)).classes for thin in ([0.1], [0.1, 0.069]))
+    assert beside[0].trees == alone[0].trees
+    assert beside[0].n_ha.se > alone[0].n_ha.se + 1.0
+
+
 def test_equal_diameters_do_not_inflate_the_error_of_the_dominant_one():
     dominant = figures(trees_of([0.2] * 40, 0.01), limits=INDEPENDENT).values["dominant_dbh_cm"]
     assert dominant == pytest.approx((20.0, 1.0 / math.sqrt(10)))
