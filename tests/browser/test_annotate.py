@@ -883,6 +883,26 @@ def test_the_map_names_the_source_of_class_and_dbh(person: Dashboard):
         expect(tip).to_contain_text(text)
 
 
+def test_the_table_has_the_diameter_that_counts(person: Dashboard):
+    page, found = person.page, person.ask("/api/trees")["trees"]
+    taped, rejected = [tree for tree in found if tree["dbh_cm"] is not None][:2]
+    add = """([x, y, kind, dbh]) => import('/static/js/annotate/annotations.js').then(
+        (it) => it.edit(() => it.send('POST', '/api/annotations', { x, y, kind, dbh_cm: dbh })))"""
+    page.evaluate(add, [taped["x"], taped["y"], "tree", 98.7])
+    page.evaluate(add, [rejected["x"], rejected["y"], "pole", 97.6])
+    person.tab("Trees")
+    cell = page.locator(f"#trees [data-tree='{taped['number']}'] td").nth(4)
+    expect(cell).to_have_text("98.7 by tape")
+    mapped = [f"{each['dbh_cm']:.1f} ± {each['sigma_dbh_cm']:.1f}" for each in (taped, rejected)]
+    expect(cell).to_have_attribute("title", f"In the map: {mapped[0]} cm")
+    other = page.locator(f"#trees [data-tree='{rejected['number']}'] td").nth(4)
+    expect(other).to_have_text(mapped[1])
+    expect(other).to_have_attribute("title", "")
+    page.locator("#find").fill("dbh > 90")
+    expect(page.locator("#trees tbody tr")).to_have_count(1)
+    page.locator("#find").fill("")
+
+
 def test_accumulated_points_lie_under_the_map_of_the_tab(person: Dashboard):
     page = person.page
     page.get_by_role("button", name="Fit").click()

@@ -270,6 +270,12 @@ export function reviewOf(tree) {
   return row.kind === SKIPPED ? SKIPPED : row.kind === "tree" ? "confirmed" : "rejected";
 }
 
+// The diameter by tape of a found tree [cm], which counts in place of that of the map; null without one.
+export function tapeOf(tree) {
+  const row = annotationOf(tree);
+  return row?.kind === "tree" ? row.dbh_cm : null;
+}
+
 // The class that N stores: the chosen one, else that of what was rejected before.
 export function rejectedKind() {
   const tree = selectedTree(), row = tree ? annotationOf(tree) : rowOf(draft.chosen);

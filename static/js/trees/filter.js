@@ -1,6 +1,6 @@
 // The filter above the table of trees: a number, ranges of columns, or the class in the ground truth.
 
-import { isReviewed, KINDS, reviewOf, STATES } from "../annotate/annotations.js";
+import { isReviewed, KINDS, reviewOf, STATES, tapeOf } from "../annotate/annotations.js";
 import { inFile } from "../core/coordinates.js";
 import { distance, nearest } from "../core/nearest.js";
 import { state } from "../core/store.js";
@@ -9,8 +9,10 @@ export const HELP = "A tree number, or conditions separated by spaces: dbh 20..3
 
 export const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2)); // of the position [cm]
 
+export const countedDbh = (tree) => tapeOf(tree) ?? tree.dbh_cm; // [cm]
+
 const COLUMNS = {
-  tree: (t) => t.number, x: (t) => inFile(t.x, t.y)[0], y: (t) => inFile(t.x, t.y)[1], "±": sigma, sigma, dbh: (t) => t.dbh_cm,
+  tree: (t) => t.number, x: (t) => inFile(t.x, t.y)[0], y: (t) => inFile(t.x, t.y)[1], "±": sigma, sigma, dbh: countedDbh,
   eccentricity: (t) => t.eccentricity, e: (t) => t.eccentricity, scans: (t) => t.observations, seen: (t) => t.observations, slices: (t) => t.observations, height: (t) => t.height_m, lean: (t) => t.lean_deg,
 };
 const NAMES = Object.keys(COLUMNS).join("|");

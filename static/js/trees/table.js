@@ -1,6 +1,6 @@
 // The table of trees (Table 2 of the paper): sorted by any column, filtered by the text above it.
 
-import { reviewOf } from "../annotate/annotations.js";
+import { reviewOf, tapeOf } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
@@ -17,7 +17,7 @@ import { openStory } from "../explain/story.js";
 import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { openTab, visible } from "../shell/tabs.js";
-import { filterOf, HELP, sigma } from "./filter.js";
+import { countedDbh, filterOf, HELP, sigma } from "./filter.js";
 
 const EVERY = 400; // [ms] between two updates
 
@@ -29,19 +29,26 @@ const COLUMNS = [
   ["x", "x", "x as in the files: of a drive in the frame of the map, along the first heading", (t) => placeTexts([t.x, t.y])[0], (t) => t.x],
   ["y", "y", "y as in the files: of a drive in the frame of the map, to the left of the first heading", (t) => placeTexts([t.x, t.y])[1], (t) => t.y],
   ["sigma", "position ± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
-  ["dbh", "DBH cm", "Diameter at breast height ± its standard deviation", (t) => dbhFigure(t.dbh_cm, t.sigma_dbh_cm), (t) => t.dbh_cm],
+  ["dbh", "DBH cm", "Diameter at breast height ± its standard deviation; by tape where a person measured it", countedText, countedDbh],
   ["height", "height m", "Height of the tree ± its standard deviation; – where another crown continues above its top, or it was not seen", (t) => heightFigure(t.height_m, t.sigma_height_m), (t) => t.height_m, true],
   ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg, true],
   ["e", "e", "Eccentricity: ratio of the eigenvalues of the covariance of a cluster, the mean over its scans", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
   ["seen", "scans", "Number of scans that detected the tree; 0: found only in the accumulated scans, or placed by a person", (t) => String(t.observations), (t) => t.observations, false],
 ];
-const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
+const [SIGMA, DBH] = ["sigma", "dbh"].map((wanted) => COLUMNS.findIndex(([key]) => key === wanted));
 const rows = new Map();
 const keepTabStop = roving(byId("trees").tBodies[0], "tr", "vertical");
 let order = { key: "number", descending: false };
 
 function sigmaText(tree) {
   return (isAssumed(tree) ? "≈ " : "") + figure(sigma(tree), 2);
+}
+
+const mappedText = (tree) => dbhFigure(tree.dbh_cm, tree.sigma_dbh_cm);
+
+function countedText(tree) {
+  const tape = tapeOf(tree);
+  return tape === null ? mappedText(tree) : `${dbhFigure(tape)} by tape`;
 }
 
 function head() {
@@ -86,6 +93,7 @@ function rowOf(tree) {
   const row = rows.get(tree.number);
   COLUMNS.forEach(([, , , text], place) => setText(row.cells[place], text(tree)));
   row.cells[SIGMA].title = isAssumed(tree) ? "Assumed, not measured: no single scan detected the tree here, only the accumulated scans did, or a person placed it" : "";
+  row.cells[DBH].title = tapeOf(tree) === null ? "" : `In the map: ${mappedText(tree)}${tree.dbh_cm === null ? "" : " cm"}`;
   row.setAttribute("aria-selected", String(tree.number === state.selected));
   return row;
 }
@@ -123,7 +131,7 @@ function fill() {
 function missing(all) {
   if (!isDrive()) return "";
   const arc = state.parameters?.values["tracking.dbh_arc_min"] ?? 0;
-  const without = all.filter((tree) => tree.dbh_cm === null);
+  const without = all.filter((tree) => countedDbh(tree) === null);
   const short = without.filter((tree) => (tree.coverage_deg ?? 0) < arc).length;
   return [[short, `need ${fixed(arc, 0)}° of view`], [without.length - short, "with uncertain DBH"]]
     .filter(([number]) => number).map(([number, words]) => `, ${number} ${number === 1 ? words.replace("need ", "needs ") : words}`).join("");
