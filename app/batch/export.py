@@ -65,11 +65,12 @@ _COUNTED = (
         "dbh_source", "dbh_source", "", "source of the diameter that counts: tape or map; empty without one"
     ),
 )
+_BASAL_AREA = Field("g_m2", "g_m2", "m2", "basal area by the diameter that counts")
 TREE_FIELDS = (
     Field("tree", "tree", "", "number of the tree in the map"),
     Field("dbh_cm", "dbh_cm", "cm", "diameter at breast height"),
     Field("sigma_dbh_cm", "sdbh_cm", "cm", "standard deviation of the diameter"),
-    Field("g_m2", "g_m2", "m2", "basal area by the diameter that counts"),
+    _BASAL_AREA,
     Field("sigma_x_m", "sx_m", "m", "standard deviation of the position along x of the map"),
     Field("sigma_y_m", "sy_m", "m", "standard deviation of the position along y of the map"),
     Field("z_m", "z_m", "m", "height of the ground at the tree"),
@@ -104,6 +105,8 @@ LAYER_FIELDS = {
         Field("length_m", "length_m", "m", "length of the path"),
     ),
     "added": (
+        Field("name", "name", "", "A1, A2, ... in the order in which people added the trees"),
+        _BASAL_AREA,
         Field("dbh_tape_cm", "dbh_tape", "cm", "diameter by tape of a tree that a person added"),
         *_COUNTED,
     ),
@@ -141,13 +144,19 @@ class ExportedRun:
     @property
     def added_columns(self) -> dict[str, Any]:
         """Dict from each name of the fields of the layer `added` to the values of these trees."""
-        counted = counted_dbh(self.added_dbh, np.full(len(self.added), np.nan))
-        return dict(zip((f.name for f in LAYER_FIELDS["added"]), (self.added_dbh, *counted), strict=True))
+        names = np.array([f"A{k + 1}" for k in range(len(self.added))], np.str_)
+        counted, source = counted_dbh(self.added_dbh, np.full(len(self.added), np.nan))
+        values = (names, _basal_area(0.01 * counted).round(4), self.added_dbh, counted, source)
+        return dict(zip((f.name for f in LAYER_FIELDS["added"]), values, strict=True))
 
     @property
     def crs(self) -> str:
         """Reference system as text for libraries; LOCAL_WKT without one."""
         return self.frame.crs or LOCAL_WKT
+
+
+def _basal_area(dbh: Float) -> Float:
+    return 0.25 * math.pi * np.square(dbh)
 
 
 R = TypeVar("R", bound=ExportedRun)
@@ -175,7 +184,7 @@ def read_for_export(folder: FilePath) -> ExportedRun:
         trees.number,
         100.0 * trees.dbh,
         100.0 * trees.dbh_sigma,
-        0.25 * math.pi * np.square(counted),
+        _basal_area(counted),
         np.sqrt(trees.covariance[:, 0, 0]),
         np.sqrt(trees.covariance[:, 1, 1]),
         ground,
@@ -378,16 +387,20 @@ STYLES = {
 def trees_geojson(run: ExportedRun) -> str:
     """Return the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map. Where
     people measured any, the trees have `dbh_tape_cm`, `dbh_counted_cm` and `dbh_source`, and those that they
-    added follow, with the review "added" and without a number."""
+    added follow, with the review "added" and a name, but without a number."""
     lon_lat = reproject(run.place, run.frame.crs, WGS84) if run.frame.crs else None
     reviews = dict(zip(run.columns["tree"].tolist(), run.columns["review"].tolist(), strict=True))
     features = tree_features(run.trees, 0, lon_lat=lon_lat, reviews=reviews)
     places = reproject(run.added, run.frame.crs, WGS84).round(8) if run.frame.crs else run.added.round(3)
-    features += [point_feature(x, y, {"tree": None, "review": "added"}) for x, y in places.tolist()]
+    added = run.added_columns
+    features += [
+        point_feature(x, y, {"tree": None, "name": name, "review": "added"})
+        for (x, y), name in zip(places.tolist(), added["name"].tolist(), strict=True)
+    ]
     if len(run.added) or np.isfinite(run.columns["dbh_tape_cm"]).any():
-        for name, of_added in run.added_columns.items():
+        for name in ("dbh_tape_cm", *(field.name for field in _COUNTED)):
             for feature, value in zip(
-                features, [*run.columns[name].tolist(), *of_added.tolist()], strict=True
+                features, [*run.columns[name].tolist(), *added[name].tolist()], strict=True
             ):
                 is_known = value if isinstance(value, str) else math.isfinite(value)
                 feature["properties"][name] = value if is_known else None

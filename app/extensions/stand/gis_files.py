@@ -194,10 +194,10 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
         drawing = ezdxf.new("R2010", units=ezdxf.units.M)
         drawing.header.custom_vars.append("CRS", run.frame.name)
         drawing.header.custom_vars.append("Program", f"stemmap {version()}")
-        names = {"TREES": 3, "LABELS": 7, "PATH": 5, "PLOTS": 30, "CONTOURS": 33}
+        colours = {"TREES": 3, "LABELS": 7, "PATH": 5, "PLOTS": 30, "CONTOURS": 33}
         if len(run.added):
-            names["ADDED"] = 1
-        for layer, colour in names.items():
+            colours["ADDED"] = 1
+        for layer, colour in colours.items():
             drawing.layers.add(layer, color=colour)
         space = drawing.modelspace()
         columns = run.columns
@@ -207,13 +207,13 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
             space.add_point((x, y, z), dxfattribs={"layer": "TREES"})
             if math.isfinite(dbh):
                 space.add_circle((x, y, z), 0.005 * dbh, dxfattribs={"layer": "TREES"})
-            text = f"{columns['tree'][k]}" + (f" {dbh:.0f}" if math.isfinite(dbh) else "")
-            label = space.add_text(text, height=0.25, dxfattribs={"layer": "LABELS"})
-            label.set_placement((x + 0.2, y + 0.2, z))
-        for (x, y), dbh in zip(run.added.tolist(), run.added_dbh.tolist(), strict=True):
+            _label_tree(space, str(columns["tree"][k]), dbh, (x, y, z))
+        names = run.added_columns["name"].tolist()
+        for name, (x, y), dbh in zip(names, run.added.tolist(), run.added_dbh.tolist(), strict=True):
             space.add_point((x, y), dxfattribs={"layer": "ADDED"})
             if math.isfinite(dbh):
                 space.add_circle((x, y), 0.005 * dbh, dxfattribs={"layer": "ADDED"})
+            _label_tree(space, name, dbh, (x, y, 0.0))
         if len(run.path) > 1:
             space.add_lwpolyline(run.path.tolist(), dxfattribs={"layer": "PATH"})
         for name, shape, _ in run.plots:
@@ -232,6 +232,13 @@ def _write_dxf(run: PlottedRun, file: FilePath) -> None:
         ezdxf.options.write_fixed_meta_data_for_testing = before
 
 
+def _label_tree(space: Any, name: str, dbh: float, place: tuple[float, float, float]) -> None:  # noqa: ANN401
+    """Add the name of a tree and its diameter [cm], if it is known, to a space of ezdxf."""
+    text = f"{name} {dbh:.0f}" if math.isfinite(dbh) else name
+    label = space.add_text(text, height=0.25, dxfattribs={"layer": "LABELS"})
+    label.set_placement((place[0] + 0.2, place[1] + 0.2, place[2]))
+
+
 def _write_xlsx(run: PlottedRun, file: FilePath) -> None:
     """Write a workbook with the sheets trees, added and plots (if there are any), fields and about.
     StemmapError if xlsxwriter is not installed."""
@@ -245,7 +252,8 @@ def _write_xlsx(run: PlottedRun, file: FilePath) -> None:
     _sheet(book, "trees", {"tree": number, **place, **run.columns}, bold)
     if len(run.added):
         added = {name: np.round(run.added[:, axis], 3) for axis, name in enumerate((first, second))}
-        _sheet(book, "added", {**added, **run.added_columns}, bold)
+        columns = run.added_columns
+        _sheet(book, "added", {"name": columns["name"], **added, **columns}, bold)
     if run.plots:
         _sheet(book, "plots", _plot_table(run), bold)
     axes = tuple(Field(name, "", "m", f"coordinate in {run.frame.name}") for name in (first, second))

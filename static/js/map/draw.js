@@ -199,8 +199,8 @@ function drawRing(pen, view, { x, y }) {
   pen.strokeRect(px - 8, py - 8, 16, 16);
 }
 
-export function drawTree(pen, view, tree, selected, rejected = false) {
-  const [px, py] = view.toScreen(tree.x, tree.y), colour = rejected ? colours.other : colours.tree;
+export function drawTree(pen, view, tree, selected, rejected = false, colour = rejected ? colours.other : colours.tree) {
+  const [px, py] = view.toScreen(tree.x, tree.y);
   drawCircle(pen, px, py, symbolRadius(tree, view.scale));
   if (tree.dbh_cm === null) { // DBH not measured: hollow
     Object.assign(pen, { strokeStyle: colour, lineWidth: 2 });

@@ -110,6 +110,16 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     expect(rows).to_have_count(0)
 
 
+# The names that are drawn beside added trees.
+NAMES_DRAWN = """async () => {
+  const { drawPlots } = await import('/static/js/extensions/stand/draw.js');
+  const names = [];
+  const get = (_, name) => (name === 'fillText' ? (text) => names.push(text) : () => {});
+  drawPlots(new Proxy({}, { get, set: () => true }), { scale: 10, toScreen: (x, y) => [x, y] });
+  return names;
+}"""
+
+
 def test_what_people_measured_is_stated_below_the_figures(person: Dashboard) -> None:
     tree = person.ask("/api/trees")["trees"][0]
     signed = {"run": person.ask("/api/annotations")["run"], "browser": "a" * 16, "who": "Ann"}
@@ -123,8 +133,12 @@ def test_what_people_measured_is_stated_below_the_figures(person: Dashboard) -> 
     expect(review).to_have_text(
         re.compile(r"Review: 1 of .*\(1 confirmed\)\. By people: 1 diameter by tape\.$")
     )
+    legend = person.page.locator("#legend-added")
+    expect(legend).to_be_hidden()
     far = {"x": 500.0, "y": 1.5, "kind": "tree"}
     person.page.evaluate(send, ["/api/annotations", {**signed, **far}])
+    expect(legend).to_have_text("added tree")
+    assert person.page.evaluate(NAMES_DRAWN) == ["A1"]
     unseen = "Added by people outside the observed area: 500.000, 1.500 m."
     expect(person.page.locator("#plots-hint")).to_contain_text(unseen)
     for _ in range(2):

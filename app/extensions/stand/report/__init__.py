@@ -276,9 +276,9 @@ def _digits(estimate: Estimate, least: int | None = None) -> int:
 
 
 def tree_rows(run: PlottedRun, trees: PlotTrees, texts: dict[str, str], number: Numbers) -> list[list[str]]:
-    """Return the trees as cells: number, two coordinates [m], diameter and its sigma [cm], height and its
-    sigma [m] if any height is known, observations, coverage [deg], state of the review; a dash for unknown
-    values. Numbers have the decimals of trees.csv, as on the page. Trees that people added come last.
+    """Return the trees as cells: number or name, two coordinates [m], diameter and its sigma [cm], height and
+    its sigma [m] if any height is known, observations, coverage [deg], state of the review; a dash for
+    unknown values. Numbers have the decimals of trees.csv, as on the page. Trees that people added come last.
 
     Args:
         run: The run, in the coordinates of its files.
@@ -288,7 +288,7 @@ def tree_rows(run: PlottedRun, trees: PlotTrees, texts: dict[str, str], number: 
     """
     c = run.columns
     heights = ("height_m", "sigma_height_m") if np.isfinite(c["height_m"]).any() else ()
-    places = np.concatenate([run.place, run.added])
+    places, names = np.concatenate([run.place, run.added]), run.added_columns["name"]
     rows = []
     for k, (x, y) in enumerate(places.tolist()):
         row = [number(x, 3), number(y, 3)]
@@ -300,7 +300,8 @@ def tree_rows(run: PlottedRun, trees: PlotTrees, texts: dict[str, str], number: 
             row += [str(c["observations"][k]), number(float(c["coverage_deg"][k]), 0)]
             row.append(texts[str(c["review"][k])] + tape)
         else:
-            row = [number(None), *row, *[number(None)] * (len(heights) + 2), texts["added"] + tape]
+            name = str(names[k - len(run.place)])
+            row = [name, *row, *[number(None)] * (len(heights) + 2), texts["added"] + tape]
         rows.append(row)
     return rows
 
@@ -333,10 +334,10 @@ def stand_map(
 
     Returns:
         A dict with `width` and `height`; `seen` and `path`, SVG path data (`path` is "" for a whole cloud);
-        `plots`, a list of (name, path data, x and y of the name); `trees`, a list of (x, y, radius, number,
-        whether the diameter is known), where the number is "" if there are more than 400 trees or a person
-        added the tree, and an unknown diameter is rendered as 15 cm; the scale bar, `bar` (length) and
-        `bar_text`; `scale` as text, such as "1 : 200"; and `up`, the word at the axis that points up.
+        `plots`, a list of (name, path data, x and y of the name); `trees`, a list of (x, y, radius, number or
+        name, whether the diameter is known), where numbers are "" if there are more than 400 trees, and an
+        unknown diameter is rendered as 15 cm; the scale bar, `bar` (length) and `bar_text`; `scale` as text,
+        such as "1 : 200"; and `up`, the word at the axis that points up.
     """
     import shapely
 
@@ -387,7 +388,7 @@ def stand_map(
             for (x, y), r, label, known in zip(
                 paper(place).tolist(),
                 radius.tolist(),
-                [*labels, *[""] * len(run.added)],
+                [*labels, *run.added_columns["name"].tolist()],
                 np.isfinite(whole.trees.dbh).tolist(),
                 strict=True,
             )

@@ -1,10 +1,11 @@
 // Plots on the 2D map: dashed outlines with their names, and the shape that is being drawn.
 
+import { rows, treeNumberOf } from "../../annotate/annotations.js";
 import { treeOf } from "../../core/store.js";
 import { colours } from "../../core/theme.js";
-import { drawCircle, drawText } from "../../map/draw.js";
+import { drawCircle, drawText, drawTree, symbolRadius } from "../../map/draw.js";
 import { controlPoints, titleOf } from "./coordinates.js";
-import { drawing, plots, ringsOf, shapeOf, sketch } from "./plots.js";
+import { drawing, plots, plotting, ringsOf, shapeOf, sketch } from "./plots.js";
 
 function outline(pen, view, ring) {
   pen.beginPath();
@@ -25,8 +26,20 @@ export function drawPlots(pen, view) {
     drawText(pen, name, px, py - 6, { font: "600 12px" });
     Object.assign(pen, { strokeStyle: colours.plot, lineWidth: 2 });
   }
+  drawAdded(pen, view);
   drawControlPoints(pen, view);
   if (drawing()) drawSketch(pen, view);
+}
+
+// Trees that people added because the map lacks them, in the order of their names in files and reports.
+export const addedTrees = () => (plotting() ? rows().filter((row) => row.kind === "tree" && treeNumberOf(row) === null) : []);
+
+function drawAdded(pen, view) {
+  for (const [place, { x, y, dbh_cm }] of addedTrees().entries()) {
+    drawTree(pen, view, { x, y, dbh_cm, ellipse: [0, 0, 0] }, false, false, colours.truth);
+    const [px, py] = view.toScreen(x, y);
+    drawText(pen, `A${place + 1}`, px + symbolRadius({ dbh_cm }, view.scale) + 5, py + 4, { font: "600 11px", align: "left" });
+  }
 }
 
 // A control point is a cross in a circle, with its name; one without a place, such as a tree that is not in the map, is left out.

@@ -8,7 +8,7 @@ import { saveWritten } from "../../core/written_file.js";
 import { toTab } from "../../shell/actions.js";
 import { extend } from "../../shell/extensions.js";
 import { drawDetour, startDetour, toggleDetour } from "./detour.js";
-import { drawPlots } from "./draw.js";
+import { addedTrees, drawPlots } from "./draw.js";
 import { plotKey, settings, startPlotsPanel } from "./panel.js";
 import { clickOn, dragTo, draw, drawing, hoverTo, plots, pressAt, release, SHAPES } from "./plots.js";
 import { reports, saveReport } from "./report.js";
@@ -34,8 +34,12 @@ const presentActions = () => [
 
 function start() {
   const legend = el("li", { id: "legend-plot", class: "plot", hidden: true, text: "plot" });
-  document.querySelector(".legend .robot").before(legend);
-  on("annotations", () => { legend.hidden = !plots().length; });
+  const added = el("li", { id: "legend-added", class: "added", hidden: true, text: "added tree", title: "A tree that a person added because the map lacks it; hollow: DBH not measured" });
+  document.querySelector(".legend .robot").before(legend, added);
+  on("annotations map tab", () => {
+    legend.hidden = !plots().length;
+    added.hidden = !addedTrees().length;
+  });
   byId("trees-export").title = "The map as a file for GIS, CAD and spreadsheets, in the coordinates that the tab Plots shows";
   startPlotsPanel();
   startDetour();

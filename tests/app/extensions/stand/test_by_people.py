@@ -165,8 +165,13 @@ def test_the_report_lists_what_people_state(run, tmp_path, capsys):
     assert len(rows) == 100
     assert rows[0] == ["1", "1.000", "1.000", "40.0", "0.3", "20", "229", "confirmed, by tape"]
     assert rows[-2:] == [
-        [DASH, "2.000", "2.000", "30.0", "0.3", DASH, DASH, "added by people, by tape"],
-        [DASH, "4.000", "2.000", DASH, DASH, DASH, DASH, "added by people"],
+        ["A1", "2.000", "2.000", "30.0", "0.3", DASH, DASH, "added by people, by tape"],
+        ["A2", "4.000", "2.000", DASH, DASH, DASH, DASH, "added by people"],
+    ]
+    assert [re.findall(rf">{name}</text>", page) for name in ("A1", "A2", "A3")] == [
+        [">A1</text>"],
+        [">A2</text>"],
+        [],
     ]
     assert page.count("<circle cx=") == 102  # two in the legend
     german = (tmp_path / "de.html").read_text()
