@@ -66,8 +66,8 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     ]
     expect(page.locator("#plots-table .sum")).to_have_count(2)
     heads = page.locator("#plots-table thead th").all_inner_texts()
-    assert heads[-2:] == ["Dq cm", "mean DBH cm"]
-    expect(page.locator("#plots-table .sum td").nth(heads.index("mean DBH cm") - 1)).to_contain_text(
+    assert heads[-3:] == ["Dq cm", "mean DBH cm", "dominant DBH cm"]
+    expect(page.locator("#plots-table .sum td").nth(heads.index("dominant DBH cm") - 1)).to_contain_text(
         re.compile(r"\d")
     )
     expect(page.locator("#plots-detection")).to_have_text(

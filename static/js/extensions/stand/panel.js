@@ -24,7 +24,8 @@ const LARGEST_FILES = 700_000; // [bytes]
 const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],
   rectangle: [["length", "length m", 10, 0.01, 2000], ["width", "width m", 10, 0.01, 2000], ["turn_deg", "turn °", 0, -360, 360]] };
 const HEADS = [["plot", ""], ["m²", "Area"], ["seen", "Observed part of the area"], ["trees", "Trees of at least the minimum diameter in the observed part"],
-  ["stems/ha", "N/ha: stems per hectare"], ["basal area m²/ha", "G/ha: basal area per hectare"], ["Dq cm", "Dq: quadratic mean diameter"], ["mean DBH cm", "Arithmetic mean diameter"]];
+  ["stems/ha", "N/ha: stems per hectare"], ["basal area m²/ha", "G/ha: basal area per hectare"], ["Dq cm", "Dq: quadratic mean diameter"], ["mean DBH cm", "Arithmetic mean diameter"],
+  ["dominant DBH cm", "Dominant diameter: quadratic mean of the 100 thickest trees per hectare"]];
 const VOLUME = ["volume m³/ha", "Stem volume per hectare"];
 let figures = { all: null, plots: null, problem: "" };
 let shown = []; // edition and scan of the figures
@@ -129,7 +130,7 @@ function estimate([value, se] = [null, null]) {
 }
 
 function cells(of, withVolume) {
-  const names = ["n_ha", "g_ha", "dg_cm", "mean_dbh_cm", ...(withVolume ? ["v_ha"] : [])];
+  const names = ["n_ha", "g_ha", "dg_cm", "mean_dbh_cm", "dominant_dbh_cm", ...(withVolume ? ["v_ha"] : [])];
   const about = of.area_m2 === undefined ? ["", "", ""] : [figure(of.area_m2), percent(of.seen_m2 / of.area_m2), String(of.trees)];
   return [...about.map((text) => el("td", { text })), ...names.map((name) => estimate(of[name]))];
 }

@@ -247,6 +247,21 @@ def test_a_small_error_is_not_rounded_to_0_and_one_that_is_not_known_is_explaine
     assert catalogue_of("en")["unknown_error"] not in fewer
 
 
+def test_plots_have_their_dominant_diameter(tmp_path, capsys):
+    run = grid_run(tmp_path / "run")
+    rows = (run / "trees.csv").read_text().splitlines()
+    column = rows[0].split(",").index("dbh_cm")
+    for number, dbh in ((45, "61.5"), (56, "52.5")):  # both in the plot
+        cells = rows[number].split(",")
+        rows[number] = ",".join((*cells[:column], dbh, *cells[column + 1 :]))
+    (run / "trees.csv").write_text("\n".join(rows) + "\n")
+    text = page_of(capsys, run, tmp_path / "r.html", ["--rectangle", "10,10,10,10", "--language", "de"])
+    head, row = re.findall(r"<tr>(<t[hd]>(?:Fläche|1)<.*)</tr>", text)[:2]
+    titles, cells = (re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in (head, row))
+    assert len(titles) == len(cells)
+    assert cells[titles.index("do cm")] == "61,5"  # one tree on 100 m2
+
+
 def test_the_first_class_begins_at_the_minimum_diameter(run, tmp_path, capsys):
     table = Page(page_of(capsys, run, tmp_path / "r.html")).texts
     assert "7 \N{EN DASH} 8" in table
