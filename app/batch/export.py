@@ -61,6 +61,7 @@ class Field:
 
 _COUNTED = (
     Field("dbh_counted_cm", "dbh_count", "cm", "diameter that counts: by tape, else of the map"),
+    Field("sigma_dbh_counted_cm", "sdbh_count", "cm", "standard deviation of the diameter that counts"),
     Field(
         "dbh_source", "dbh_source", "", "source of the diameter that counts: tape or map; empty without one"
     ),
@@ -145,8 +146,10 @@ class ExportedRun:
     def added_columns(self) -> dict[str, Any]:
         """Dict from each name of the fields of the layer `added` to the values of these trees."""
         names = np.array([f"A{k + 1}" for k in range(len(self.added))], np.str_)
-        counted, source = counted_dbh(self.added_dbh, np.full(len(self.added), np.nan))
-        values = (names, _basal_area(0.01 * counted).round(4), self.added_dbh, counted, source)
+        dbh, unknown = 0.01 * self.added_dbh, np.full(len(self.added), np.nan)
+        counted, sigma, source = counted_dbh(dbh, unknown, unknown)
+        in_cm = ((100.0 * value).round(1) for value in (dbh, counted, sigma))
+        values = (names, _basal_area(counted).round(4), *in_cm, source)
         return dict(zip((f.name for f in LAYER_FIELDS["added"]), values, strict=True))
 
     @property
@@ -179,7 +182,7 @@ def read_for_export(folder: FilePath) -> ExportedRun:
     unknown = np.full(len(trees.number), np.nan)
     people = read_by_people(folder)
     tape = people.tape_of(trees.number.tolist())
-    counted, source = counted_dbh(tape, trees.dbh)
+    counted, counted_sigma, source = counted_dbh(tape, trees.dbh, trees.dbh_sigma)
     values = (
         trees.number,
         100.0 * trees.dbh,
@@ -199,9 +202,10 @@ def read_for_export(folder: FilePath) -> ExportedRun:
         np.array(list(run.reviews.values()), np.str_),
         100.0 * tape,
         100.0 * counted,
+        100.0 * counted_sigma,
         source,
     )
-    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0, 1, 1, 0)
+    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0, 1, 1, 1, 0)
     columns = {
         field.name: np.round(v, d) if v.dtype.kind == "f" else v
         for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)
@@ -386,8 +390,8 @@ STYLES = {
 
 def trees_geojson(run: ExportedRun) -> str:
     """Return the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map. Where
-    people measured any, the trees have `dbh_tape_cm`, `dbh_counted_cm` and `dbh_source`, and those that they
-    added follow, with the review "added" and a name, but without a number."""
+    people measured any, the trees have `dbh_tape_cm` and the diameter that counts with its sigma and source,
+    and those that they added follow, with the review "added" and a name, but without a number."""
     lon_lat = reproject(run.place, run.frame.crs, WGS84) if run.frame.crs else None
     reviews = dict(zip(run.columns["tree"].tolist(), run.columns["review"].tolist(), strict=True))
     features = tree_features(run.trees, 0, lon_lat=lon_lat, reviews=reviews)

@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 
 # Largest distance between an annotation and the same object in a map or a ground truth [m].
 SAME_THING = 0.5
-# Standard deviation of a diameter that a person measured [m]: 0.3 cm between four people on 319 trees, there
-# with calipers (Luoma et al. 2017, Forests 8(2), 38).
-TAPE_SIGMA = 0.003
 # Reviews by the class of the annotation.
 _STATES = {**dict.fromkeys(KINDS, REJECTED), "tree": CONFIRMED, SKIPPED: SKIPPED}
 # What figures and exports of a run need, besides its trees.

@@ -44,6 +44,9 @@ from pipeline.types.records import Int, Path, Trees, TruthTrees
 LARGEST_FILE = 256 << 20
 #: Columns of BY_PEOPLE; `of_tree` is empty for a tree that the map lacks.
 BY_PEOPLE_COLUMNS = ("of_tree", "x_m", "y_m", "dbh_tape_cm")
+# Standard deviation of a diameter that a person measured [m]: 0.3 cm between four people on 319 trees, there
+# with calipers (Luoma et al. 2017, Forests 8(2), 38).
+TAPE_SIGMA = 0.003
 _FILES = (
     "trees.csv",
     "path.csv",
@@ -103,17 +106,17 @@ class ByPeople:
         return np.array([self.tape.get(number, math.nan) for number in numbers], np.float64)
 
 
-def counted_dbh(tape: Float, of_map: Float) -> tuple[Float, NDArray[np.str_]]:
-    """Return the diameter of each tree that counts, and its source: "tape", else "map", "" where it is
-    unknown.
+def counted_dbh(tape: Float, of_map: Float, sigma: Float) -> tuple[Float, Float, NDArray[np.str_]]:
+    """Return the diameter of each tree that counts, its standard deviation, TAPE_SIGMA by tape, and its
+    source: "tape", else "map", "" where it is unknown.
 
     Args:
-        tape: Diameters by tape, shape (T,); NaN where unknown.
-        of_map: Those of the map, likewise.
+        tape: Diameters by tape, shape (T,) [m]; NaN where unknown.
+        of_map, sigma: Those of the map and their standard deviations, likewise.
     """
     by_tape = np.isfinite(tape)
     source = np.where(by_tape, "tape", np.where(np.isfinite(of_map), "map", ""))
-    return np.where(by_tape, tape, of_map), source
+    return np.where(by_tape, tape, of_map), np.where(by_tape, TAPE_SIGMA, sigma), source
 
 
 def read_run(folder: FilePath) -> FinishedRun:

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.batch.run_edits import SAME_THING, TAPE_SIGMA
+from app.batch.run_edits import SAME_THING
+from app.batch.run_folder import TAPE_SIGMA
 from app.store.async_store import AsyncStore
 from app.store.records import (
     FRAME,

@@ -142,16 +142,17 @@ class ShownRun:
 
     def trees_text(self, people: ByPeople) -> str:
         """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
-        coordinates of the files; where any was measured by tape, with `dbh_tape_cm`, `dbh_counted_cm` and
-        `dbh_source`, see `counted_dbh`; with a reference system also their `easting_m` and `northing_m` in
-        it. `people` is the result of `by_people`."""
+        coordinates of the files; where any was measured by tape, with `dbh_tape_cm`, `dbh_counted_cm`,
+        `sigma_dbh_counted_cm` and `dbh_source`, see `counted_dbh`; with a reference system also their
+        `easting_m` and `northing_m` in it. `people` is the result of `by_people`."""
         trees = in_file(self.shown.frame.trees, self.one_step)
         names, rows = TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews())
         if people.tape:
-            names = (*names, "dbh_tape_cm", "dbh_counted_cm", "dbh_source")
+            names = (*names, "dbh_tape_cm", "dbh_counted_cm", "sigma_dbh_counted_cm", "dbh_source")
             tape = people.tape_of(self._numbered()[0])
-            counted, source = counted_dbh(tape, trees.dbh[trees.confirmed])
-            texts = ([number_text(100.0 * dbh, 1) for dbh in column] for column in (tape, counted))
+            dbh, sigma = trees.dbh[trees.confirmed], trees.dbh_sigma[trees.confirmed]
+            *counted, source = counted_dbh(tape, dbh, sigma)
+            texts = ([number_text(100.0 * value, 1) for value in column] for column in (tape, *counted))
             rows = [(*row, *more) for row, *more in zip(rows, *texts, source.tolist(), strict=True)]
         if self.frame is not None and self.frame.content.values is not None:
             given = self.frame.content.values["frame"]

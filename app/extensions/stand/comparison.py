@@ -12,7 +12,6 @@ import numpy as np
 import shapely
 
 from app.batch.map_frame import WGS84, MapFrame, read_map_frame, reproject
-from app.batch.run_edits import TAPE_SIGMA
 from app.batch.run_folder import counted_dbh, read_by_people, read_run, read_seen_area
 from app.batch.visits import (
     VisitComparison,
@@ -134,8 +133,8 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
         seen = None if recorded is None else within_reach(recorded.clear_cells(), Stand())
         sigma = np.sqrt(0.5 * np.trace(trees.covariance, axis1=1, axis2=2))
         tape = read_by_people(path).tape_of(trees.number.tolist())
-        dbh_sigma = np.where(np.isfinite(tape), TAPE_SIGMA, trees.dbh_sigma)
-        found = VisitTrees(trees.number, trees.position, sigma, counted_dbh(tape, trees.dbh)[0], dbh_sigma)
+        dbh, dbh_sigma, _ = counted_dbh(tape, trees.dbh, trees.dbh_sigma)
+        found = VisitTrees(trees.number, trees.position, sigma, dbh, dbh_sigma)
         visit = Visit(str(path), found, run.rejected.position, seen, read_map_frame(path))
     else:
         table = read_truth_trees(path, dbh_unit=dbh_unit)

@@ -13,7 +13,6 @@ import numpy as np
 import shapely
 
 from app.batch.map_frame import MapFrame, read_map_frame
-from app.batch.run_edits import TAPE_SIGMA
 from app.batch.run_folder import (
     ByPeople,
     FinishedRun,
@@ -230,8 +229,8 @@ def people_words(counted: PeopleCount) -> str:
 
 def counted_trees(trees: Trees, people: ByPeople, parameters: Stand) -> PlotTrees:
     """Return the trees of stand figures: those of the map in their order, then those that people added. A
-    diameter by tape, with TAPE_SIGMA, takes the place of that of the map; an added tree has no other diameter
-    and no height. They have volumes by the formula of the parameters, unless it is empty.
+    diameter by tape takes the place of that of the map, see `counted_dbh`; an added tree has no other
+    diameter and no height. They have volumes by the formula of the parameters, unless it is empty.
 
     Args:
         trees: Trees of the map without those that a person rejected.
@@ -248,10 +247,11 @@ def counted_trees(trees: Trees, people: ByPeople, parameters: Stand) -> PlotTree
         """Return a column of the trees of the map with unknown values for the others."""
         return np.full(len(tape), np.nan) if column is None else np.concatenate([column, unknown])
 
+    diameter, sigma, _ = counted_dbh(tape, with_added(trees.dbh), with_added(trees.dbh_sigma))
     counted = PlotTrees(
         np.concatenate([trees.position, people.added]),
-        counted_dbh(tape, with_added(trees.dbh))[0],
-        np.where(by_tape, TAPE_SIGMA, with_added(trees.dbh_sigma)),
+        diameter,
+        sigma,
         height=with_added(trees.height),
         by_tape=by_tape,
         added=np.arange(len(tape)) >= len(trees.number),

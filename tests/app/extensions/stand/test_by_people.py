@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.batch.run_edits import TAPE_SIGMA, reviewed_run
-from app.batch.run_folder import ByPeople, read_run
+from app.batch.run_edits import reviewed_run
+from app.batch.run_folder import TAPE_SIGMA, ByPeople, read_run
 from app.dashboard.shown_run import ShownRun
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plots import rectangle

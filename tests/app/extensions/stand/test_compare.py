@@ -11,8 +11,8 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
-from app.batch.run_edits import TAPE_SIGMA, reviewed_run
-from app.batch.run_folder import read_run
+from app.batch.run_edits import reviewed_run
+from app.batch.run_folder import TAPE_SIGMA, read_run
 from app.batch.visits import VisitTrees, compare_visits
 from app.extensions.stand.comparison import read_visit
 from app.store.records import Content

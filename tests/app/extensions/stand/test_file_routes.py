@@ -53,7 +53,9 @@ async def test_what_people_measured_is_in_the_files_of_the_page(both: Running, t
     (first, *others) = csv.DictReader((await client.get("/api/trees.csv")).text.splitlines())
     assert (first["dbh_tape_cm"], first["review"]) == ("23.4", "confirmed")
     assert {row["dbh_tape_cm"] for row in others} <= {""}
-    assert (first["dbh_counted_cm"], first["dbh_source"]) == ("23.4", "tape")
+    counted_columns = ("dbh_counted_cm", "sigma_dbh_counted_cm", "dbh_source")
+    assert [first[name] for name in counted_columns] == ["23.4", "0.3", "tape"]
+    assert all(row["sigma_dbh_counted_cm"] == row["sigma_dbh_cm"] for row in others)
     counted = [(row["dbh_counted_cm"], row["dbh_source"]) for row in others]
     assert counted == [(row["dbh_cm"], "map" if row["dbh_cm"] else "") for row in others]
     file = tmp_path / "trees.gpkg"

@@ -150,26 +150,58 @@ def test_what_people_measured_is_in_every_format(tmp_path, capsys):
     for file in files.values():
         assert stemmap(capsys, "export", run, "--to", file).code == 0
     for part, layer, *names in (
-        (files["gpkg"], "added", "name", "g_m2", "dbh_tape_cm", "dbh_counted_cm", "dbh_source"),
-        (tmp_path / "trees_added.shp", None, "name", "g_m2", "dbh_tape", "dbh_count", "dbh_source"),
+        (
+            files["gpkg"],
+            "added",
+            "name",
+            "g_m2",
+            "dbh_tape_cm",
+            "dbh_counted_cm",
+            "sigma_dbh_counted_cm",
+            "dbh_source",
+        ),
+        (
+            tmp_path / "trees_added.shp",
+            None,
+            "name",
+            "g_m2",
+            "dbh_tape",
+            "dbh_count",
+            "sdbh_count",
+            "dbh_source",
+        ),
     ):
         with fiona.open(part, layer=layer) as table:
             rows = [[row.geometry.coordinates[0], *(row.properties[name] for name in names)] for row in table]
-        assert rows[0] == [pytest.approx(500002.0), "A1", 0.0755, 31.0, 31.0, "tape"]
-        assert rows[1][:5] == [pytest.approx(500004.0), "A2", None, None, None]
-        assert not rows[1][5]
+        assert rows[0] == [pytest.approx(500002.0), "A1", 0.0755, 31.0, 31.0, 0.3, "tape"]
+        assert rows[1][:6] == [pytest.approx(500004.0), "A2", None, None, None, None]
+        assert not rows[1][6]
     with fiona.open(files["gpkg"], layer="trees") as table:
         tape = {row.properties["tree"]: row.properties["dbh_tape_cm"] for row in table}
     assert {number: dbh for number, dbh in tape.items() if dbh is not None} == {5: 23.4}
     book = openpyxl.load_workbook(files["xlsx"])
     assert list(book["added"].values)[:2] == [
-        ("name", "east_m", "north_m", "g_m2", "dbh_tape_cm", "dbh_counted_cm", "dbh_source"),
-        ("A1", 500002, 5300002, 0.0755, 31, 31, "tape"),
+        (
+            "name",
+            "east_m",
+            "north_m",
+            "g_m2",
+            "dbh_tape_cm",
+            "dbh_counted_cm",
+            "sigma_dbh_counted_cm",
+            "dbh_source",
+        ),
+        ("A1", 500002, 5300002, 0.0755, 31, 31, 0.3, "tape"),
     ]
     header, *rows = book["trees"].values
     counted = [dict(zip(header, row, strict=True)) for row in rows]
     assert {(of["dbh_counted_cm"], of["dbh_source"]) for of in counted if of["tree"] == 5} == {(23.4, "tape")}
     assert {of["dbh_source"] for of in counted if of["tree"] != 5} == {"map"}
+    sigmas = [
+        {of["sigma_dbh_counted_cm"] for of in counted if (of["tree"] == 5) == taped}
+        for taped in (True, False)
+    ]
+    assert sigmas == [{0.3}, {of["sigma_dbh_cm"] for of in counted}]
     drawing = files["dxf"].read_text()
     assert all(text in drawing for text in ("ADDED", "\nA1 31\n", "\nA2\n"))
     features = json.loads(files["geojson"].read_text())["features"]
