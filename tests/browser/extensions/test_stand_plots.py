@@ -146,6 +146,27 @@ def test_what_people_measured_is_stated_below_the_figures(person: Dashboard) -> 
     expect(review).to_have_text(re.compile(r"Review: 0 of \d+ found trees reviewed\.$"))
 
 
+# The text about corrected figures of the whole area, of two plots of which one was observed, and of two.
+CORRECTIONS = """async () => {
+  const { correctionText } = await import('/static/js/extensions/stand/panel.js');
+  const figures = { detection_sigma_m: 8, mean: { n_ha_corrected: [521, 79], g_ha_corrected: [30.1, 4.2] } };
+  const [seen, hidden] = [{ seen_m2: 100 }, { seen_m2: 0 }];
+  return [
+    correctionText({ ...figures, plots: { all: seen } }, true),
+    correctionText({ ...figures, plots: { north: seen, south: hidden } }, false),
+    correctionText({ ...figures, plots: { a: seen, b: seen } }, false),
+  ];
+}"""
+
+
+def test_corrected_figures_say_of_which_area_they_are(person: Dashboard) -> None:
+    said = [
+        re.findall("the corrected ones, (.*?) stems/ha", text) for text in person.page.evaluate(CORRECTIONS)
+    ]
+    places = ("the whole observed area", "plot north", "the mean of 2 plots")
+    assert said == [[f"of {place}: 521 ± 79"] for place in places]
+
+
 def test_a_typed_rectangle_is_a_plot(person: Dashboard) -> None:
     page = person.page
     page.get_by_text("Type a plot").click()

@@ -221,15 +221,17 @@ const NO_DECREASE = { "": "Detection does not decrease with distance within reac
 function detectionText() {
   const { all, plots: own } = figures;
   const shownPlots = [all, own].flatMap((each) => Object.values(each?.plots ?? {}));
-  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: [stems, se] }) => stems !== null && se === null) ? UNKNOWN_ERROR : "");
+  return correctionText(own ?? all ?? {}, !own) + (shownPlots.some(({ n_ha: [stems, se] }) => stems !== null && se === null) ? UNKNOWN_ERROR : "");
 }
 
-function correctionText({ detection_sigma_m: sigma, detection_not_estimated: reason, plots: of, mean }) {
+export function correctionText({ detection_sigma_m: sigma, detection_not_estimated: reason, plots: of, mean }, isWhole) {
   if (!of) return "";
   if (sigma === null) return NO_DECREASE[reason];
   const { n_ha_corrected: stems, g_ha_corrected: basal } = mean;
   const words = (of, unit) => `${plusMinus(...of)} ${unit}`;
-  return `Use the figures above. If trees far from the path were missed, use the corrected ones: ${words(stems, "stems/ha")}, ${words(basal, "m²/ha")} `
+  const names = Object.keys(of).filter((name) => of[name].seen_m2 > 0);
+  const place = isWhole ? "of the whole observed area" : names.length === 1 ? `of plot ${names[0]}` : `of the mean of ${names.length} plots`;
+  return `Use the figures above. If trees far from the path were missed, use the corrected ones, ${place}: ${words(stems, "stems/ha")}, ${words(basal, "m²/ha")} `
     + `(detection decreases with distance: half-normal, sigma ${figure(sigma)} m). They are too large where the stand is thinner away from the path.`;
 }
 
