@@ -245,8 +245,12 @@ class AnnotationEditor:
     @property
     def in_truth(self) -> list[Content]:
         """The annotations that are objects of `truth`: its last ones, in this order."""
-        used = counted(self._own, self.rows, self.against)
-        return [row.content for row in self.rows] if used in ("annotations", "both") else []
+        return [row.content for row in self.rows] if self.used in ("annotations", "both") else []
+
+    @property
+    def used(self) -> Counted:
+        """Ground truth that is used for the scores, see `counted`."""
+        return counted(self._own, self.rows, self.against)
 
     def score_against(self, against: Against) -> None:
         """Choose the ground truth for the scores, see `truth_of`, and call `changed`. No annotation
@@ -365,7 +369,7 @@ class AnnotationEditor:
             "run": self.run,
             "serial": self.serial,
             "problem": self.problem,
-            "used": counted(self._own, self.rows, self.against),
+            "used": self.used,
             "against": self.against,
             "own": None if self._own is None else len(self._own.x),
             "contradicting": contradicting(self._own, self.rows),

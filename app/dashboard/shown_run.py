@@ -44,6 +44,7 @@ from pipeline.seen_area import SeenArea, SeenRecorder, covered_area
 from pipeline.types.records import Path, Trees, TruthTrees
 
 if TYPE_CHECKING:
+    from app.dashboard.annotations import Counted
     from app.dashboard.dashboard import Dashboard
 
 
@@ -65,6 +66,7 @@ class ShownRun:
         frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
             none.
         recordings: Absolute paths of the files to which a live run was recorded.
+        references: What `truth` consists of, see `counted` of `app.dashboard.annotations`.
     """
 
     request: SourceRequest
@@ -80,6 +82,7 @@ class ShownRun:
     edits: tuple[Annotation, ...]
     frame: Annotation | None
     recordings: tuple[str, ...] = ()
+    references: Counted = "source"
 
     @classmethod
     def of(cls, dashboard: Dashboard) -> ShownRun:
@@ -101,6 +104,7 @@ class ShownRun:
             (*editor.rows, *editor.skipped, *editor.others),
             editor.frame,
             dashboard.run_recorder.recordings,
+            editor.used,
         )
 
     @property
@@ -218,7 +222,8 @@ class ShownRun:
         `recordings` of a live run, if there are any; `seed`, `odometry`, `preset`, `changed` and
         `parameters`; `scans` (0 without a drive), `duration_s` and `distance_m`; `trees`, without the
         rejected ones, and `rejected`, their number; `evaluation`, which reviews do not change, None without
-        ground truth; `repairs`, see `repairs_record`, if there are any; and those of `_counts`."""
+        ground truth; `references`, "annotations" or "both" if its ground truth has annotations; `repairs`,
+        see `repairs_record`, if there are any; and those of `_counts`."""
         status, truth = self.status, truth_in_file(self.truth, self.one_step)
         trees = in_file(self.shown.frame.trees, self.one_step)
         rejected = sum(review == REJECTED for review in self.reviews().values())
@@ -252,6 +257,7 @@ class ShownRun:
             "trees": int(np.count_nonzero(trees.confirmed)) - rejected,
             "rejected": rejected,
             "evaluation": scores,
+            **({"references": self.references} if self.references in ("annotations", "both") else {}),
             **repairs,
             **self._counts(scores),
         }

@@ -19,8 +19,10 @@ from app.batch.run_folder import TAPE_SIGMA, ByPeople, read_run
 from app.dashboard.shown_run import ShownRun
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.plots import rectangle
+from app.extensions.stand.report import report_page
 from app.extensions.stand.run_figures import counted_trees, stand_of, stand_record, stand_summary
 from app.store.records import Content
+from pipeline.types.records import TruthTrees
 from tests.app.batch.finished_runs import grid_run
 from tests.app.cli.test_commands import stemmap
 from tests.app.dashboard.test_annotations import both, edit
@@ -184,6 +186,29 @@ def test_tables_have_the_numbers(run, tmp_path, capsys):
     header, row = (line.split(",") for line in (tmp_path / "stand.csv").read_text().splitlines())
     of = dict(zip(header, row, strict=True))
     assert [of[name] for name in ("dbh_by_tape", "trees_added", "trees_removed")] == ["2", "2", "2"]
+
+
+@pytest.mark.parametrize(
+    ("against", "words"),
+    [
+        ("both", "ground truth of the run with the annotations of people"),
+        ("own", "ground truth of the run"),
+        ("annotations", "annotations of people"),
+    ],
+)
+async def test_the_report_names_the_references_of_its_scores(both, against, words) -> None:
+    client, dashboard = both
+    await look(dashboard)
+    trees = dashboard.shown.frame.trees
+    x, y = trees.position[trees.confirmed][0].tolist()
+    truth = TruthTrees(np.array([x]), np.array([y]), np.array([0.4]), ("tree",))
+    editor = dashboard.annotation_editor
+    await editor.begin(dashboard.digest, dashboard.source.uri, truth)
+    await edit(client, "POST", x=x, y=y, kind="tree", dbh_cm=44.4)
+    editor.score_against(against)
+    with ShownRun.of(dashboard).folder() as folder:
+        page = report_page(folder)
+    assert f"<tr><td>Reference trees and diameters</td><td>{words}</td></tr>" in page
 
 
 async def test_page_and_command_give_the_same_figures(both, tmp_path, capsys) -> None:
