@@ -567,7 +567,7 @@ def _classes(
         n_se = math.sqrt(rest * len(basal) + unsure)
         middle = _basal_area(0.5 * (low + high))
         g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance + unsure * middle**2)
-        if rest > 0.0 and n_se <= NEGLIGIBLE:  # no tree, and nothing tells how many are out of sight
+        if not len(basal) and n_se <= NEGLIGIBLE:  # nothing tells how many the map lacks
             n_se = g_se = math.nan
         rows.append(
             DiameterClass(

@@ -132,17 +132,20 @@ def test_the_error_of_a_class_is_not_known_where_that_of_all_stems_is_not():
     d = np.linspace(0.18, 0.38, 40)
     assumed = figures(trees_of(d, 0.02), detection=(1.0, math.nan), limits=INDEPENDENT)
     assert math.isnan(assumed.values["n_ha"].se)
-    assert all(math.isnan(c.n_ha.se) and c.g_ha.se > 0.0 for c in assumed.classes)
+    assert all(math.isnan(c.n_ha.se) for c in assumed.classes)
+    assert all(c.g_ha.se > 0.0 for c in assumed.classes if c.trees)
     corrected = figures(trees_of(d, 0.02), detection=(0.8, 0.05), limits=INDEPENDENT)
     assert all(math.isnan(c.n_ha.se) for c in corrected.classes)
     complete = figures(trees_of(d, 0.02))
-    assert all(c.n_ha.se > 0.0 for c in complete.classes)
+    assert all(c.n_ha.se > 0.0 for c in complete.classes if c.trees)
     partly = figures(trees_of(d, 0.02), area=2000.0, seen=1000.0, detection=(0.8, 0.05))
     errors = [c.n_ha.se for c in partly.classes if c.trees]
     assert np.all(errors > 10.0 * np.sqrt([0.5 * c.trees for c in partly.classes if c.trees]))
     empty = figures(trees_of([0.2, 0.5], 0.001), area=2000.0, seen=1000.0).classes[6]
     assert (empty.trees, empty.n_ha.value) == (0, 0.0)
-    assert math.isnan(empty.n_ha.se)
+    assert math.isnan(empty.n_ha.se + empty.g_ha.se)
+    complete = figures(trees_of([0.2, 0.5], 0.001), detection=(1.0, math.nan)).classes[6]
+    assert math.isnan(complete.n_ha.se + complete.g_ha.se)
     gaps = compared_with_gaps(partly, trees_of([0.3] * 200), 1500.0, Stand())
     assert all(math.isnan(c.n_ha.se + c.g_ha.se) for c in gaps.classes)
 
