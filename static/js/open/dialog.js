@@ -7,6 +7,7 @@ import { on, state } from "../core/store.js";
 import { parametersText } from "../playback/timeline.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { progressOf } from "../shell/status.js";
+import { forgetQuestion, mayLeave } from "./leaving.js";
 import { completion, isListed, listPlaces, nearMisses, sift } from "./places.js";
 import { isLive, recordingOf, rememberRobot, showRobot, startRobotForm } from "./robot_form.js";
 import { chosenFor, startInside } from "./source_options.js";
@@ -73,9 +74,10 @@ export async function ask(uri) {
     say("Enter a path or an address, for example sim:stand.");
     return;
   }
+  say("");
+  if (!await mayLeave()) return;
   requested = uri;
   left = state.status;
-  say("");
   setText(byId("source-open"), "Opening…");
   showWait(`Checking ${uri}.`);
   if (isLive(uri)) rememberRobot(uri);
@@ -125,6 +127,7 @@ function showWait(text, progress = "") {
 }
 
 function say(text) {
+  forgetQuestion();
   const error = byId("source-error");
   setText(error, capital(text));
   error.hidden = !text;

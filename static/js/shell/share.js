@@ -6,6 +6,7 @@ import { clock, count } from "../core/format.js";
 import { access, endViewerLink, looksOnly, refreshAccess, startAccess } from "../core/permissions.js";
 import { attempted, showProblem } from "../core/problem.js";
 import { on, state } from "../core/store.js";
+import { mayLeave } from "../open/leaving.js";
 import { controlOf, sentOf } from "../scene/viser_client.js";
 
 const PATIENCE = 120_000; // [ms] for a run to open
@@ -111,7 +112,10 @@ async function follow() {
   if (!run || looksOnly()) return;
   try {
     const source = { uri: run, ...optionsOf(options) };
-    if (!isOpen(source)) await open(source);
+    if (!isOpen(source)) {
+      if (!await mayLeave()) return;
+      await open(source);
+    }
     if (!await until(() => state.status?.source === run && state.status.scan_index >= 0)) return;
     if (!Number.isFinite(time)) return;
     await command("pause");

@@ -2,7 +2,7 @@
 
 import { reviewOf, reviewProgress } from "../annotate/annotations.js";
 import { command } from "../core/api.js";
-import { byId, el, setText } from "../core/dom.js";
+import { byId, el, recall, remember, setText } from "../core/dom.js";
 import { capital, figure, NONE } from "../core/format.js";
 import { edits, looksOnly, refusedText } from "../core/permissions.js";
 import { attempted, showNews } from "../core/problem.js";
@@ -204,6 +204,7 @@ function showState() {
 function showRecording(recording, isConnected) {
   if (/^(recording|finishing)/.test(recordingBefore) && recording.startsWith("recorded")) showNews(`${capital(recording)}: ${state.status.recorded_file}`);
   if (isConnected) recordingBefore = recording;
+  showLeft(isConnected);
   const box = byId("recording"), isOn = isConnected && isRecording(), canBegin = isConnected && canRecord();
   box.hidden = !recording && !canBegin;
   box.disabled = !(isOn || canBegin) || looksOnly();
@@ -214,6 +215,14 @@ function showRecording(recording, isConnected) {
   const told = [recording, state.status?.recorded_file].filter(Boolean).join("\n");
   box.title = !isConnected ? `Before the connection was lost: ${told}`
     : [told, isOn ? "Press twice to end the recording, while the run goes on" : canBegin ? `Press to record the messages of the robot from now on${recording ? ", to a new file" : ""}` : ""].filter(Boolean).join("\n");
+}
+
+// The recording of the robot that was left for another run, see open/leaving.js; it is complete when that run has begun to open.
+function showLeft(isConnected) {
+  const file = recall("left", "sessionStorage");
+  if (!file || !isConnected || !state.status || state.status.state === "starting" || state.status.recorded_file === file) return;
+  remember("left", "", "sessionStorage");
+  showNews(`Recorded: ${file}`);
 }
 
 let recordingBefore = "";
