@@ -13,8 +13,10 @@ import numpy as np
 from app.common.text import count
 from pipeline.config import Parameters
 from pipeline.evaluation import MapScores, PathError, Rate
+from pipeline.geometry.poses import Float
 from pipeline.io.readers import packet_formats
 from pipeline.map_faults import DOUBTFUL
+from pipeline.odometry.synchroniser import JUMP_SPEED, PAUSE_NS
 from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
 
 if TYPE_CHECKING:
@@ -309,9 +311,21 @@ def breaks_of(sources: Iterable[RunSource]) -> list[int]:
     return [source.from_scan for source in sources if source.start not in _SAME_DRIVE]
 
 
+def driven_steps(path: Path) -> Float:
+    """Return the distance driven from each scan to the next one [m], shape (N - 1,) for N > 0.
+
+    It is 0 across a pause that the synchroniser reports, since a sender may have begun anew meanwhile, and
+    where a step is faster than its limit of a jump: the pose was set, the robot did not drive.
+    """
+    metres: Float = np.hypot(np.diff(path.x), np.diff(path.y))
+    time_ns = np.diff(path.stamp_ns)
+    is_driven = (time_ns <= PAUSE_NS) & (metres <= JUMP_SPEED * np.maximum(time_ns * _NS, 0.1))
+    return np.where(is_driven, metres, 0.0)
+
+
 def driven(path: Path, breaks: Iterable[int] = ()) -> tuple[float, float]:
     """Return duration [s] and distance [m] of the drives, without the gaps between two drives; 0, 0 for fewer
-    than two scans.
+    than two scans. See `driven_steps`.
 
     Args:
         path: One row per scan.
@@ -320,7 +334,7 @@ def driven(path: Path, breaks: Iterable[int] = ()) -> tuple[float, float]:
     is_step = np.ones(max(len(path.x) - 1, 0), np.bool_)
     is_step[[scan - 1 for scan in breaks if 0 < scan < len(path.x)]] = False
     seconds = float(np.diff(path.stamp_ns)[is_step].sum()) * _NS
-    return seconds, float(np.hypot(np.diff(path.x), np.diff(path.y))[is_step].sum())
+    return seconds, float(driven_steps(path)[is_step].sum())
 
 
 def summary_lines(

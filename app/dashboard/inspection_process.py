@@ -96,7 +96,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
     from app.batch.run_folder import damaged_record, read_run
-    from app.batch.summary import lost_share
+    from app.batch.summary import driven, lost_share
     from app.dashboard.payload import trees_payload
     from app.dashboard.run_recorder import thinned
 
@@ -118,7 +118,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "chosen": record.get("chosen"),
         "scans": scans,
         "time_s": time_s,
-        "distance_m": float(np.hypot(*np.diff(path_xy, axis=0).T).sum()) if len(path_xy) else 0.0,
+        "distance_m": driven(run.path)[1],
         "lost": lost,
         "trees": len(trees),
         "rejected": len(run.rejected.number),

@@ -15,7 +15,7 @@ import numpy as np
 from app.batch.map_frame import write_map_frame
 from app.batch.run_edits import by_people_text, measured_by_people, reviews_of
 from app.batch.run_folder import ByPeople, as_written, counted_dbh, recorded_time, score_map
-from app.batch.summary import far_truth, left_out_warning, unconfirmed_warning
+from app.batch.summary import driven, far_truth, left_out_warning, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
 from app.sources.one_step import OneStep
@@ -109,8 +109,8 @@ class ShownRun:
 
     @property
     def distance_m(self) -> float:
-        """Length of the path [m], rounded to 1 mm."""
-        return round(float(np.hypot(np.diff(self.path.x), np.diff(self.path.y)).sum()), 3)
+        """Driven distance [m], rounded to 1 mm."""
+        return round(driven(self.path)[1], 3)
 
     @property
     def one_step(self) -> OneStep | None:

@@ -13,6 +13,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from app.batch.summary import driven_steps
 from app.common.settings import RunBudget, RunStorage
 from app.common.timers import TOTAL, Stopwatch
 from app.explain.records import History
@@ -162,7 +163,7 @@ class Run:
         scans = np.append(scans[:-1][evenly_spaced(len(scans) - 1, most - 1)], scans[-1:])
         values = {name: series.values(name, scans) for name in names}
         if "driven" in values:
-            driven = np.append(0.0, np.cumsum(np.hypot(np.diff(path.x), np.diff(path.y))))
+            driven = np.append(0.0, np.cumsum(driven_steps(path)))
             values["driven"] = np.append(driven[: len(path.x)], np.nan)[np.minimum(scans, len(path.x))]
         total = series.values("mapping", scans)
         measured = [name for name in series.names if stages and name.startswith(STAGE)]

@@ -33,6 +33,14 @@ def test_two_drives_are_as_long_as_each_of_them(first, second, jump):
     assert both == pytest.approx(apart, abs=1e-9)
 
 
+def test_a_pose_that_is_set_elsewhere_is_not_driven():
+    drive = [(0.1, 0.0, 10**8)] * 30
+    begun_anew, found = (-3.0, 0.0, 76 * 10**9), (16.4, 0.0, 10**8)
+    assert driven(path_of([*drive, begun_anew, *drive, found, *drive]))[1] == pytest.approx(9.0)
+    scans_lost = (12.0, 0.0, 6 * 10**9)
+    assert driven(path_of([*drive, scans_lost]))[1] == pytest.approx(15.0), "the odometry went on"
+
+
 def test_the_same_drive_that_goes_on_is_one():
     starts = ("origin", "resume", "constellation", "given", "last", "merged")
     sources = [RunSource("run", "", 10 * k, start, (0, 0, 0), 0, 0) for k, start in enumerate(starts)]
