@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from app.robot.source import SILENT_S
 from pipeline.config.model import Value
 from pipeline.types.records import Float, Frame, Zone
 
@@ -62,6 +63,7 @@ class Events:
         self._health = "good"
         self._lasting: frozenset[Kind] = frozenset()
         self._silent_since = math.nan  # [s since the first scan]
+        self._scans = 0  # number of the scans between which silences were searched for
         self._base: tuple[str, dict[str, Value]] | None = None
         self._edits = ("", 0)
 
@@ -72,10 +74,16 @@ class Events:
         self._confirmed.clear()
         self._warnings, self._health, self._base = frozenset(), "good", None
         self._lasting = frozenset()
-        self._silent_since = math.nan
+        self._silent_since, self._scans = math.nan, 0
         self._edits = ("", 0)
 
-    def shown(self, frame: Frame, time_s: float, confirmed_s: Float | None = None) -> bool:
+    def shown(
+        self,
+        frame: Frame,
+        time_s: float,
+        confirmed_s: Float | None = None,
+        scans_s: Float | None = None,
+    ) -> bool:
         """Add the events of a shown scan; return whether the list of events changed.
 
         A tree that is confirmed again after stepping back keeps the event of its first confirmation. Flagged
@@ -88,6 +96,8 @@ class Events:
             time_s: Time of the frame [s since the first scan].
             confirmed_s: Confirmation time of each tree of the frame, shape (T,) [s since the first scan], NaN
                 if unknown; None if all are unknown. A tree without a known time gets the event at `time_s`.
+            scans_s: Times of all scans up to the frame, shape (N,) [s since the first scan]. A time between
+                two of them that is longer than SILENT_S is a silence. None in a live run, see `silent`.
         """
         known = set(self._events)
         passed = {key for key, event in self._before.items() if event.time_s <= time_s}
@@ -98,6 +108,8 @@ class Events:
         for number in sorted(confirmed - self._confirmed):
             self._note(f"tree {number}", Event(at.get(number, time_s), "tree", f"Tree {number} mapped"))
         self._confirmed |= confirmed
+        if scans_s is not None:
+            self._note_silences(scans_s)
         if not time_s <= self._silent_since:
             self._note_changes(frame, time_s)
         return self._events.keys() != known or bool(passed)
@@ -119,6 +131,15 @@ class Events:
             elif ahead.zone == Zone.CLEAR:  # an obstacle in the stop zone is in the slow zone as well
                 self._turn("slow", False, time_s, "No obstacle in the slow zone")
         self._turn("silence", False, time_s, "Data again")
+
+    def _note_silences(self, scans_s: Float) -> None:
+        """Add the silences between the scans that came since the last call."""
+        new = scans_s[max(self._scans - 1, 0) :]
+        self._scans = max(self._scans, len(scans_s))
+        for k in np.flatnonzero(np.diff(new) > SILENT_S).tolist():
+            self.silent("No scans in the recording", float(new[k]))
+            self._turn("silence", False, float(new[k + 1]), "Data again")
+            self._silent_since = math.nan  # a person may go back before it
 
     def silent(self, why: str, time_s: float) -> bool:
         """Add an event for a robot that sends no data, unless it has one; it ends with the next shown scan.

@@ -98,6 +98,19 @@ def test_stops_and_doubts_end_at_a_silence_and_begin_again_after_it():
     assert len(lasting(events)) == 6
 
 
+def test_a_gap_of_a_recording_is_a_silence_at_which_a_stop_ends():
+    events, stopped = Events(), replace(seen(0, 0), clearance=Clearance(Zone.STOP, ahead=0.8))
+    scans = np.array([0.0, 1.0, 77.0, 77.5, 80.0])
+    for until in (1, 2, 3, 4, 2, 3, 4):  # also after a person went back
+        events.shown(replace(stopped, index=until), scans[until - 1], None, scans[:until])
+    silences = [(1.0, "silence", 76.0)]
+    assert lasting(events) == [(0.0, "stop", 1.0), *silences, (77.0, "stop", None)]
+    events.forget()
+    events.shown(stopped, 0.0, None, scans[:1])
+    events.shown(replace(seen(4, 0), clearance=Clearance(Zone.CLEAR)), 80.0, None, scans)  # a jump ahead
+    assert lasting(events) == [(0.0, "stop", 1.0), *silences, (77.5, "silence", 2.5)]
+
+
 def test_a_recording_is_logged_and_outlasts_a_silence():
     events = Events()
     assert not events.recorded("", "", 0.0)
