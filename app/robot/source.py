@@ -123,6 +123,7 @@ def link_for(address: Address) -> MakeLink:
 #: The nodes of a robot start one after another: topics are chosen this long after the first scan topic [s].
 _SETTLE_S = 1.0
 _POLL_S = 0.005
+_MOST_TOPICS = 10  # that a message lists
 #: Ends of the notices when the scans of a robot are not announced any more, and when they are again.
 GONE, BACK = "sends no scans any more", "sends scans again"
 #: A longer silence is reported [s]; a LiDAR of 5 Hz pauses for 0.2 s.
@@ -456,7 +457,7 @@ class LiveSource:
             problem = self._link.problem.rstrip(".")
             reason = f"{problem}{'' if problem.endswith('?') else '.'} It is tried again every second"
         elif self._choice is None:
-            reason = f"{self._link.place}; {self._link.nothing}"
+            reason = f"{self._link.place}; {self._not_announced()}"
         elif self._there is False:
             reason = f"{self._name()} is gone; the map goes on when it is back"
         else:
@@ -464,6 +465,16 @@ class LiveSource:
         return f"{since}: {reason}" if since else f"Waiting: {reason}"
 
     # --- private --------------------------------------------------------------------------------
+
+    def _not_announced(self) -> str:
+        """Return why no scan topic is chosen; if the topic that the user named is not announced, with the
+        topics that are."""
+        named = self._topics.get("scan")
+        there = sorted({p.topic for p in self._link.publishers() if p.msgtype in SCAN_TYPES})
+        if named is None or named in there:
+            return self._link.nothing
+        others = f"scans are announced as {', '.join(there[:_MOST_TOPICS])}" if there else self._link.nothing
+        return f"the topic {named} is not announced; {others}"
 
     @property
     def _base(self) -> str:

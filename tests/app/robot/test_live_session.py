@@ -155,6 +155,17 @@ def announce(link: FakeLink, sending: Any) -> None:
     link.version += 1
 
 
+def test_a_topic_that_is_not_announced_is_named_with_those_that_are(sending):
+    with stage() as on:
+        on.commands.put(Open(f"{URI}?scan=/nope"))
+        until(lambda: on.status and on.status.detail.endswith(
+            "the topic /nope is not announced; no scans of a robot are announced"))  # fmt: skip
+        announce(on.links[0], sending)
+        (scans,) = (topic.topic for topic in sending.topics if topic.msgtype == POINT_CLOUD)
+        told = f"the topic /nope is not announced; scans are announced as {scans}"
+        until(lambda: on.status.detail.endswith(told), lambda: on.status.detail)
+
+
 def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
     with stage() as on:
         on.commands.put(Open(URI))
