@@ -89,6 +89,21 @@ LOGGED = """async (live) => {
 }"""
 
 
+# What of the log is wider than its panel, and headings that touch one another.
+CRAMPED = """() => {
+  const log = document.getElementById('log'), wide = [...log.querySelectorAll('*')]
+    .filter((node) => node.getBoundingClientRect().right > log.getBoundingClientRect().right);
+  const boxes = [...log.querySelectorAll('th')].map((node) => {
+    const range = document.createRange();
+    range.selectNodeContents(node);
+    return [node, range.getBoundingClientRect()];
+  });
+  const touch = boxes.filter(([node, a]) => boxes.some(([other, b]) => other !== node
+    && a.left < b.right + 4 && b.left < a.right + 4 && a.top < b.bottom && b.top < a.bottom));
+  return [...wide, ...touch.map(([node]) => node)].map((node) => node.outerHTML.slice(0, 80));
+}"""
+
+
 def test_the_log_lists_stops_and_silences_with_their_times(dashboard: Dashboard):
     page = dashboard.page
     dashboard.pause()
@@ -103,6 +118,10 @@ def test_the_log_lists_stops_and_silences_with_their_times(dashboard: Dashboard)
     expect(rows.first).to_contain_text("lasts")  # the newest first
     expect(rows.last.locator("td").first).to_have_text("1:05.0")
     expect(rows.last).to_contain_text("3.25 s")
+    for width, height in ((390, 844), (1024, 700), (1260, 720)):
+        page.set_viewport_size({"width": width, "height": height})
+        dashboard.drawn()
+        assert page.evaluate(CRAMPED) == [], width
     page.locator("#log-kind").select_option("tree")
     expect(rows).to_have_count(1)
     page.locator("#log-kind").select_option("lasting")

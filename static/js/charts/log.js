@@ -20,7 +20,7 @@ const dateOf = (seconds) => (seconds > OLDEST ? new Date(1000 * seconds) : null)
 const byRobot = ({ t }) => (state.eventsStart > OLDEST ? dateOf(state.eventsStart + t) : null);
 const byComputer = ({ noted_s: noted }) => (isLive() ? dateOf(noted) : null); // of a recording nothing happens now
 const duration = (event) => (!lasts(event) ? "" : event.for_s === null ? "lasts" : `${figure(event.for_s)} s`);
-const timeCell = (date) => el("td", { text: date?.toLocaleTimeString("sv-SE") ?? "", title: date?.toLocaleString("sv-SE") ?? "" });
+const timeCell = (date) => el("td", { class: "clock", text: date?.toLocaleTimeString("sv-SE") ?? "", title: date?.toLocaleString("sv-SE") ?? "" });
 
 export function showLog() {
   const kinds = [...new Set(state.events.map(({ kind }) => kind))].sort();
@@ -34,12 +34,12 @@ export function showLog() {
   if (![...choice.options].some(({ value }) => value === filter)) filter = LASTING; // a kind of another run
   choice.value = filter;
   const canSeek = isDrive() && !isLive();
-  const titles = ["run", ...(isLive() ? ["computer's clock"] : []), "robot's clock", "lasted", "what"];
+  const titles = [["run"], ...(isLive() ? [["computer's clock", "clock"]] : []), ["robot's clock", "clock"], ["lasted", "lasted"], ["what"]];
   const rows = events().reverse().map((event) => el("tr", {},
     el("td", {}, canSeek ? timeLink(event.t) : clock(event.t)), ...(isLive() ? [timeCell(byComputer(event))] : []), timeCell(byRobot(event)),
-    el("td", { class: "figure", text: duration(event) }), el("td", { text: event.text })));
+    el("td", { class: "figure lasted", text: duration(event) }), el("td", { text: event.text })));
   box.replaceChildren(choice, rows.length
-    ? el("table", {}, el("thead", {}, el("tr", {}, ...titles.map((text) => el("th", { scope: "col", text })))), el("tbody", {}, ...rows))
+    ? el("table", {}, el("thead", {}, el("tr", {}, ...titles.map(([text, name]) => el("th", { scope: "col", class: name ?? "", text })))), el("tbody", {}, ...rows))
     : el("p", { class: "empty", text: filter === LASTING ? "No obstacle ahead, no silence, and the pose was good." : "No such event." }));
   if (isFocused) choice.focus();
 }
