@@ -62,6 +62,7 @@ class Events:
         self._warnings: frozenset[str] = frozenset()
         self._health = "good"
         self._lasting: frozenset[Kind] = frozenset()
+        self._obstacles: dict[Kind, tuple[str, float]] = {}  # key, least distance [m]
         self._silent_since = math.nan  # [s since the first scan]
         self._scans = 0  # number of the scans between which silences were searched for
         self._base: tuple[str, dict[str, Value]] | None = None
@@ -74,6 +75,7 @@ class Events:
         self._confirmed.clear()
         self._warnings, self._health, self._base = frozenset(), "good", None
         self._lasting = frozenset()
+        self._obstacles.clear()
         self._silent_since, self._scans = math.nan, 0
         self._edits = ("", 0)
 
@@ -99,7 +101,7 @@ class Events:
             scans_s: Times of all scans up to the frame, shape (N,) [s since the first scan]. A time between
                 two of them that is longer than SILENT_S is a silence. None in a live run, see `silent`.
         """
-        known = set(self._events)
+        known = dict(self._events)
         passed = {key for key, event in self._before.items() if event.time_s <= time_s}
         self._before = {key: event for key, event in self._before.items() if key not in passed}
         # Without existing marks: removed marks of many trees would otherwise reappear.
@@ -112,7 +114,7 @@ class Events:
             self._note_silences(scans_s)
         if not time_s <= self._silent_since:
             self._note_changes(frame, time_s)
-        return self._events.keys() != known or bool(passed)
+        return self._events != known or bool(passed)
 
     def _note_changes(self, frame: Frame, time_s: float) -> None:
         """Add the events of the pose quality, of obstacles in the zones and of a silence that ends."""
@@ -123,14 +125,26 @@ class Events:
             self._note(f"health {frame.index}", Event(time_s, "health", text, health.state != "good"))
         ahead = frame.clearance
         if ahead is not None and ahead.zone != Zone.UNKNOWN:  # else nothing is known of the zones
-            text = f"Obstacle in the {ahead.zone.label} zone, {ahead.ahead:.1f} m ahead"
-            is_stop = ahead.zone == Zone.STOP
-            self._turn("stop", is_stop, time_s, text if is_stop else "No obstacle in the stop zone")
-            if ahead.zone == Zone.SLOW:
-                self._turn("slow", True, time_s, text)
-            elif ahead.zone == Zone.CLEAR:  # an obstacle in the stop zone is in the slow zone as well
-                self._turn("slow", False, time_s, "No obstacle in the slow zone")
+            self._note_obstacle("stop", ahead.zone == Zone.STOP, time_s, ahead.ahead)
+            if (
+                ahead.zone != Zone.STOP or "slow" in self._lasting
+            ):  # what is in the stop zone is in it as well
+                self._note_obstacle("slow", ahead.zone != Zone.CLEAR, time_s, ahead.ahead)
         self._turn("silence", False, time_s, "Data again")
+
+    def _note_obstacle(self, kind: Kind, is_there: bool, time_s: float, ahead_m: float) -> None:
+        """Begin or end the event of an obstacle in a zone, and update its least distance, except at an
+        earlier time, to which a person went back."""
+        if self._turn(kind, is_there, time_s, f"No obstacle in the {kind} zone"):
+            self._obstacles[kind] = (_key(kind, is_there, time_s), math.inf)
+        if not is_there:
+            return
+        key, least_m = self._obstacles[kind]
+        event = self._events.get(key)
+        if event is not None and event.time_s <= time_s and ahead_m < least_m:
+            self._obstacles[kind] = (key, ahead_m)
+            text = f"Obstacle in the {kind} zone, {ahead_m:.2f} m ahead at its nearest"
+            self._events[key] = replace(event, text=text)
 
     def _note_silences(self, scans_s: Float) -> None:
         """Add the silences between the scans that came since the last call."""
@@ -269,7 +283,7 @@ class Events:
         if on == (kind in self._lasting):
             return False
         self._lasting ^= {kind}
-        self._note(f"{kind} {on} {time_s:.2f}", Event(time_s, kind, text, on))
+        self._note(_key(kind, on, time_s), Event(time_s, kind, text, on))
         return True
 
     def _set_aside(self, which: Callable[[Event], bool]) -> set[str]:
@@ -297,6 +311,11 @@ class Events:
         self._events.setdefault(key, replace(event, noted_s=time.time()) if now else event)
         while len(self._events) > _MOST:
             del self._events[min(self._events, key=lambda known: _goes(self._events[known].kind))]
+
+
+def _key(kind: Kind, on: bool, time_s: float) -> str:
+    """Return the key of the begin or the end of what lasts."""
+    return f"{kind} {on} {time_s:.2f}"
 
 
 def _goes(kind: Kind) -> int:

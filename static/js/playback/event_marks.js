@@ -15,7 +15,7 @@ function showMarks() {
   const end = state.status?.end_s;
   const lane = byId("marks");
   const events = end > 0 ? state.events.filter(({ kind }) => kind !== "slow") : []; // there are many; the log lists them
-  const key = `${end} ${events.length} ${events.at(-1)?.text} ${events.map((event) => `${event.t}${event.before ? "b" : ""}`).join()}`;
+  const key = `${end} ${events.map((event) => `${event.t}${event.text}${event.before ? "b" : ""}`).join()}`;
   if (lane.dataset.shown === key) return;
   lane.dataset.shown = key;
   const focused = lane.contains(document.activeElement) ? document.activeElement.title : null;

@@ -68,9 +68,9 @@ def test_stops_silences_and_doubts_are_logged_with_their_durations():
     assert lasting(events)[-1] == (3.5, "silence", None)
     assert events.shown(seen(5, 0), 15.5)
     assert lasting(events)[-3:] == [(1.0, "stop", 2.5), (3.5, "slow", 0.0), (3.5, "silence", 12.0)]
-    assert (3.5, "slow", "Obstacle in the slow zone, 1.5 m ahead") in marks(events)
+    assert (3.5, "slow", "Obstacle in the slow zone, 1.50 m ahead at its nearest") in marks(events)
     assert (15.5, "silence", "Data again") in marks(events)
-    assert (1.0, "stop", "Obstacle in the stop zone, 0.8 m ahead") in marks(events)
+    assert (1.0, "stop", "Obstacle in the stop zone, 0.80 m ahead at its nearest") in marks(events)
     assert events.silent("gone again", 15.5)
 
 
@@ -96,6 +96,22 @@ def test_stops_and_doubts_end_at_a_silence_and_begin_again_after_it():
     events.silent("gone", 65.0)
     events.shown(seen(3, 0), 70.0)
     assert len(lasting(events)) == 6
+
+
+def test_an_obstacle_is_logged_with_its_least_distance():
+    events = Events()
+    ahead = [(Zone.SLOW, 2.5), (Zone.SLOW, 2.0), (Zone.STOP, 0.9), (Zone.STOP, 0.14), (Zone.STOP, 0.5)]
+    for k, (zone, distance) in enumerate([*ahead, (Zone.SLOW, 1.2), (Zone.CLEAR, np.inf), (Zone.SLOW, 2.9)]):
+        has_changed = events.shown(replace(seen(k, 0), clearance=Clearance(zone, ahead=distance)), 0.1 * k)
+        assert has_changed == (k != 4), "the page follows"
+    nearest = [(t, text) for t, _, text in marks(events) if text.startswith("Obstacle")]
+    assert nearest == [
+        (0.0, "Obstacle in the slow zone, 0.14 m ahead at its nearest"),
+        (0.2, "Obstacle in the stop zone, 0.14 m ahead at its nearest"),
+        (0.7, "Obstacle in the slow zone, 2.90 m ahead at its nearest"),
+    ]
+    events.shown(replace(seen(1, 0), clearance=Clearance(Zone.SLOW, ahead=2.0)), 0.1)  # a person went back
+    assert [(t, text) for t, _, text in marks(events) if text.startswith("Obstacle")] == nearest
 
 
 def test_a_gap_of_a_recording_is_a_silence_at_which_a_stop_ends():
