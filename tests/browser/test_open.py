@@ -84,6 +84,16 @@ def test_a_near_miss_is_suggested(dialog: Page, folder: Path) -> None:
     expect(near.get_by_role("button").first).to_have_text(str(folder / "spring" / "north stand.mcap"))
 
 
+def test_a_host_and_port_are_suggested_as_the_address_of_a_router(dialog: Page) -> None:
+    for typed in ("127.0.0.1:7447", "tcp/robot.local:7447?robot=red"):
+        dialog.locator("#source-uri").fill(typed)
+        dialog.locator("#source-open").click()
+        near = dialog.locator("#source-near button").first
+        expect(near).to_have_text(f"zenoh:tcp/{typed.removeprefix('tcp/')}")
+        near.click()
+        expect(dialog.locator("#source-uri")).to_have_value(f"zenoh:tcp/{typed.removeprefix('tcp/')}")
+
+
 def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extensions(
     dialog: Page, folder: Path, extensions: str
 ) -> None:

@@ -96,10 +96,11 @@ function likeness(a, b) {
   return (2 * [...one].filter((pair) => two.has(pair)).length) / Math.max(1, one.size + two.size);
 }
 
-// Known addresses like one that could not be opened, the most alike first.
+// Known addresses like one that could not be opened, the most alike first; before them the router at a host and port.
 export function nearMisses(uri) {
+  const [, router] = /^(?:tcp\/)?([\w.-]+:\d{2,5}(?:\?\S*)?)$/.exec(uri) ?? [];
   const typed = shortSource(uri).toLowerCase();
-  return [...new Set(entries.map((each) => each.uri))].filter((other) => other !== uri)
+  return [...(router ? [`zenoh:tcp/${router}`] : []), ...[...new Set(entries.map((each) => each.uri))].filter((other) => other !== uri)
     .map((other) => [other, Math.max(likeness(typed, shortSource(other).toLowerCase()), likeness(uri.toLowerCase(), other.toLowerCase()))])
-    .filter(([, alike]) => alike >= ALIKE).sort((a, b) => b[1] - a[1]).slice(0, MOST_NEAR).map(([other]) => other);
+    .filter(([, alike]) => alike >= ALIKE).sort((a, b) => b[1] - a[1]).map(([other]) => other)].slice(0, MOST_NEAR);
 }
