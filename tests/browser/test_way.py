@@ -175,6 +175,7 @@ REAL_STATUS = """async () => {
 def test_a_notice_covers_no_button(dashboard: Dashboard):
     page = dashboard.page
     dashboard.stand(6.05)
+    page.evaluate(STAYS)
     for name in ("Trees", "Tune"):
         dashboard.tab(name)
         for width, height in ((1440, 900), (1280, 720), (390, 844), (1260, 720)):
@@ -182,9 +183,10 @@ def test_a_notice_covers_no_button(dashboard: Dashboard):
             dashboard.drawn()
             assert not page.evaluate(UNHEARD)
             assert page.evaluate(COVERED, "#notice") in ([], ["notice-open"]), f"{name}, {width} px"
+            page.evaluate(REAL_STATUS)
             page.evaluate(SILENT, 12)
-            assert page.evaluate(COVERED, "#way") == [], f"{name}, {width} px"
-    page.evaluate(REAL_STATUS)
+            assert page.evaluate(COVERED, "#way") == ["way-sound"], f"{name}, {width} px"
+    page.reload()
 
 
 def test_a_silence_is_as_loud_as_a_stop_and_the_picture_looks_stale(dashboard: Dashboard):
@@ -194,7 +196,8 @@ def test_a_silence_is_as_loud_as_a_stop_and_the_picture_looks_stale(dashboard: D
     why = "Robot forwarder-07 is gone; the map goes on when it is back"
     for for_s, zone in ((2, "slow"), (12, "silent")):
         text, shown, has_no_notice, *filters = page.evaluate(SILENT, for_s)
-        assert (text, shown) == (f"■ No data for {for_s} s\n{why}", zone)
+        sound = ["Sound is off …"] if zone == "silent" else []
+        assert (text.splitlines(), shown) == ([f"■ No data for {for_s} s", why, *sound], zone)
         assert has_no_notice, "one alarm, not two"
         assert filters == ["grayscale(1)"] * 2
     health = page.locator("[data-figure=health]")
@@ -359,6 +362,30 @@ def test_sound_and_vibration_for_the_stop_zone_are_off_until_a_person_wants_them
     drive_to_the_person()
     dashboard.until("() => new Set(window.signals).size === 2")
     dashboard.pause()
+
+
+def test_a_warning_of_a_live_run_tells_once_that_sound_is_off(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    page.evaluate(STAYS)
+    hint, box = page.locator("#way-sound"), page.locator("#alarm-sound")
+    expect(hint).to_be_hidden()
+    for turned_on in (False, True):
+        page.evaluate("() => localStorage.removeItem('stemmap.alarm-sound')")
+        page.evaluate(SILENT, 12)
+        hint.click()
+        expect(box).to_be_focused()
+        box.set_checked(turned_on)
+        page.keyboard.press("Escape")
+        page.evaluate(SILENT, 13)
+        expect(page.locator("#way")).to_be_visible()
+        expect(hint).to_be_hidden()
+    box.evaluate("(box) => { box.checked = false; }")
+    page.evaluate("() => localStorage.removeItem('stemmap.alarm-sound')")
+    page.evaluate(SILENT, 2)
+    expect(hint).to_be_hidden()  # not yet as loud as a stop
+    page.evaluate(REAL_STATUS)
+    page.reload()
 
 
 def test_a_silence_of_the_robot_has_a_signal_of_its_own(dashboard: Dashboard):

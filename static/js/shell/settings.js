@@ -67,6 +67,11 @@ export function startSettings() {
       if (wanted) give(STOP); // so that a person knows it
     });
   }
+  byId("way-sound").addEventListener("click", () => {
+    remember("alarm-sound", "off"); // as long as the person does not switch it on
+    if (!byId("keys-dialog").open) byId("keys-dialog").showModal();
+    byId("alarm-sound").focus();
+  });
   on("status", showStorage);
   byId("alarm-vibration").parentElement.hidden = !navigator.vibrate;
   on("map", signal);

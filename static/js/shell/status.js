@@ -261,6 +261,8 @@ function showWay() {
   if (text) setText(zone, text);
   setText(distance, silence ? ` for ${silence.for_s} s` : clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
   setText(why, silence ? silence.why : "");
+  // Until a person of this browser has seen the setting.
+  byId("way-sound").hidden = !state.status?.live || !["stop", "silent"].includes(way.dataset.zone) || byId("alarm-sound").checked || recall("alarm-sound") !== null;
   // An open dialog covers everything outside of it.
   const place = [...document.querySelectorAll("dialog:modal")].at(-1) ?? document.querySelector(".strip");
   if (way.parentElement !== place) place.append(way);
