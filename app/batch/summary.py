@@ -315,11 +315,15 @@ def driven_steps(path: Path) -> Float:
     """Return the distance driven from each scan to the next one [m], shape (N - 1,) for N > 0.
 
     It is 0 across a pause that the synchroniser reports, since a sender may have begun anew meanwhile, and
-    where a step is faster than its limit of a jump: the pose was set, the robot did not drive.
+    where a step is faster than its limit of a jump: the pose was set, the robot did not drive. No pause is
+    shorter than two usual steps: a robot may stop for each scan.
     """
     metres: Float = np.hypot(np.diff(path.x), np.diff(path.y))
     time_ns = np.diff(path.stamp_ns)
-    is_driven = (time_ns <= PAUSE_NS) & (metres <= JUMP_SPEED * np.maximum(time_ns * _NS, 0.1))
+    usual_ns = np.percentile(time_ns, 25, method="lower") if len(time_ns) else 0
+    is_driven = (time_ns <= max(PAUSE_NS, 2 * usual_ns)) & (
+        metres <= JUMP_SPEED * np.maximum(time_ns * _NS, 0.1)
+    )
     return np.where(is_driven, metres, 0.0)
 
 

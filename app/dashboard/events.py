@@ -99,7 +99,8 @@ class Events:
             confirmed_s: Confirmation time of each tree of the frame, shape (T,) [s since the first scan], NaN
                 if unknown; None if all are unknown. A tree without a known time gets the event at `time_s`.
             scans_s: Times of all scans up to the frame, shape (N,) [s since the first scan]. A time between
-                two of them that is longer than SILENT_S is a silence. None in a live run, see `silent`.
+                two of them that is longer than SILENT_S, and than two usual ones, is a silence. None in a
+                live run, see `silent`.
         """
         known = dict(self._events)
         passed = {key for key, event in self._before.items() if event.time_s <= time_s}
@@ -126,9 +127,8 @@ class Events:
         ahead = frame.clearance
         if ahead is not None and ahead.zone != Zone.UNKNOWN:  # else nothing is known of the zones
             self._note_obstacle("stop", ahead.zone == Zone.STOP, time_s, ahead.ahead)
-            if (
-                ahead.zone != Zone.STOP or "slow" in self._lasting
-            ):  # what is in the stop zone is in it as well
+            # What is in the stop zone is in the slow zone as well.
+            if ahead.zone != Zone.STOP or "slow" in self._lasting:
                 self._note_obstacle("slow", ahead.zone != Zone.CLEAR, time_s, ahead.ahead)
         self._turn("silence", False, time_s, "Data again")
 
@@ -147,10 +147,12 @@ class Events:
             self._events[key] = replace(event, text=text)
 
     def _note_silences(self, scans_s: Float) -> None:
-        """Add the silences between the scans that came since the last call."""
+        """Add the silences between the scans that came since the last call: times longer than SILENT_S and
+        than two usual ones, since some sensors give a scan in several seconds."""
         new = scans_s[max(self._scans - 1, 0) :]
         self._scans = max(self._scans, len(scans_s))
-        for k in np.flatnonzero(np.diff(new) > SILENT_S).tolist():
+        usual_s = np.percentile(np.diff(scans_s), 25, method="lower") if len(scans_s) > 1 else 0.0
+        for k in np.flatnonzero(np.diff(new) > max(SILENT_S, 2.0 * usual_s)).tolist():
             self.silent("No scans in the recording", float(new[k]))
             self._turn("silence", False, float(new[k + 1]), "Data again")
             self._silent_since = math.nan  # a person may go back before it

@@ -41,6 +41,10 @@ def test_a_pose_that_is_set_elsewhere_is_not_driven():
     assert driven(path_of([*drive, scans_lost]))[1] == pytest.approx(15.0), "the odometry went on"
 
 
+def test_a_robot_that_stops_for_each_scan_has_driven():
+    assert driven(path_of([(5.0, 0.0, 60 * 10**9)] * 10))[1] == pytest.approx(50.0)
+
+
 def test_the_same_drive_that_goes_on_is_one():
     starts = ("origin", "resume", "constellation", "given", "last", "merged")
     sources = [RunSource("run", "", 10 * k, start, (0, 0, 0), 0, 0) for k, start in enumerate(starts)]

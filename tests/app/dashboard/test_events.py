@@ -127,6 +127,13 @@ def test_a_gap_of_a_recording_is_a_silence_at_which_a_stop_ends():
     assert lasting(events) == [(0.0, "stop", 1.0), *silences, (77.5, "silence", 2.5)]
 
 
+def test_a_sensor_with_a_scan_in_five_seconds_is_not_silent_between_them():
+    events, scans = Events(), np.array([0.0, 5.0, 10.0, 15.0, 60.0, 65.0])
+    for until in range(1, 7):
+        events.shown(seen(until, 0), scans[until - 1], None, scans[:until])
+    assert lasting(events) == [(15.0, "silence", 45.0)]
+
+
 def test_a_recording_is_logged_and_outlasts_a_silence():
     events = Events()
     assert not events.recorded("", "", 0.0)
