@@ -555,6 +555,12 @@ def test_the_second_click_of_a_double_click_answers_nothing(person: Dashboard):
     expect(page.locator("#review-refused")).to_be_hidden()
     person.until_server("/api/annotations", "it.trees.length === 2")
     assert [row["kind"] for row in rows(person)] == ["tree", "other"]
+
+    # The reason covers the picture for a while only.
+    person.card_shown()
+    page.evaluate("import('/static/js/annotate/annotations.js').then(it => it.refuseHeld())")
+    expect(page.locator("#review-refused")).to_be_visible()
+    expect(page.locator("#review-refused")).to_be_hidden()
     assert person.errors == []
 
 
