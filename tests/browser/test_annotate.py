@@ -1028,6 +1028,28 @@ def test_two_annotators_get_different_trees_and_a_page_on_another_tab_follows(
     assert person.errors == []
 
 
+# The next tree of the review after another page has selected a tree, has left it, and its answer has come.
+NEXT_BESIDE_ANOTHER = """async (number) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const { following } = await import('/static/js/annotate/annotations.js');
+  const next = [];
+  for (const [others, topic] of [[[number], 'others'], [[], 'others'], [[], 'annotations']]) {
+    state.selectedByOthers = others;
+    changed(topic);
+    next.push(following()[0].number);
+  }
+  return next;
+}"""
+
+
+def test_a_tree_that_another_page_has_just_left_is_not_the_next_one(person: Dashboard):
+    first, second, *_ = doubted(person)
+    person.page.evaluate("import('/static/js/core/live_feed.js').then(it => it.select(null))")
+    person.until("() => document.getElementById('review-title').textContent === ''")
+    found = person.page.evaluate(NEXT_BESIDE_ANOTHER, first["number"])
+    assert found == [second["number"], second["number"], first["number"]]
+
+
 @pytest.mark.slow
 def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser, tmp_path: Path):
     with Server(STEMMAP_FOLDER=str(tmp_path)) as first, opened(chromium, first.link) as person:

@@ -293,8 +293,16 @@ const compared = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
 
 const skippedAt = (tree) => annotationOf(tree)?.at_s ?? 0; // 0: open
 
-// Another person may be answering for it.
-const isSelectedByOther = ({ number }) => state.selectedByOthers.includes(number);
+// Another person may be answering for it, or has answered a moment ago: the selection arrives before the answer.
+const isSelectedByOther = ({ number }) => state.selectedByOthers.includes(number) || leftByOthers.has(number);
+const leftByOthers = new Set(); // numbers of the trees that other pages had selected since the last message on annotations
+let selectedBefore = [];
+
+function noteOthers() {
+  const now = state.selectedByOthers;
+  for (const number of selectedBefore) if (!now.includes(number)) leftByOthers.add(number);
+  selectedBefore = now;
+}
 
 // Found trees that are open or skipped. Open trees come first, sorted by doubt and then by the number of observations; skipped
 // trees follow in the order in which they were skipped. Trees that other pages have selected come last.
@@ -595,6 +603,8 @@ export function startAnnotating() {
   });
   on("annotations map selection", keepOneSelection);
   on("selection", forgetTreeBefore);
+  on("others", noteOthers);
+  on("annotations", () => leftByOthers.clear());
   on("tab", () => {
     state.keepsSelection = annotating() || visible("repair");
     if (annotating()) showCard();
