@@ -270,7 +270,7 @@ SYMBOLS = """async () => {
   for (const thing of [...things, { x: 0, y: 0, kind: 'person' }]) {
     drawTruth(pen, { scale: 10, toScreen: (x, y) => [x, y] }, thing);
   }
-  state.truth = [{ x: 7, y: 8, dbh_cm: null, kind: 'tree' }];
+  state.truth = [{ x: 7, y: 8, dbh_cm: null, kind: 'tree', annotated: true, taped: false }];
   state.annotations = { ...state.annotations, trees: [{ id: 1, x: 7, y: 8, kind: 'tree', dbh_cm: null }],
     others: { repair }, used: 'annotations' };
   changed('truth');
