@@ -314,9 +314,9 @@ def breaks_of(sources: Iterable[RunSource]) -> list[int]:
 def driven_steps(path: Path) -> Float:
     """Return the distance driven from each scan to the next one [m], shape (N - 1,) for N > 0.
 
-    It is 0 across a pause that the synchroniser reports, since a sender may have begun anew meanwhile, and
-    where a step is faster than its limit of a jump: the pose was set, the robot did not drive. No pause is
-    shorter than two usual steps: a robot may stop for each scan.
+    The distance is 0 across a pause (PAUSE_NS), because the sender may have restarted, and across a jump
+    (JUMP_SPEED), because the pose was set and the robot did not drive. A pause is also longer than twice the
+    lower quartile of the times between scans, because a robot may stop for each scan.
     """
     metres: Float = np.hypot(np.diff(path.x), np.diff(path.y))
     time_ns = np.diff(path.stamp_ns)

@@ -395,7 +395,8 @@ class ImportPlan:
         filled: Id, version and new content of each annotation that gets a DBH.
         conflicts: The annotation and the row that contradicts it, of each row that is left out for that.
         repeated: Number of rows that say nothing new.
-        beside: Distance from its annotation, of each row that lies beside it [m].
+        beside: Distance between row and annotation [m], of each row that is about an annotation but not at
+            its place.
     """
 
     added: list[Content]

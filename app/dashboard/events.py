@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from app.robot.source import SILENT_S
+from app.sources.live_address import SILENT_S
 from pipeline.config.model import Value
 from pipeline.types.records import Float, Frame, Zone
 
@@ -98,9 +98,8 @@ class Events:
             time_s: Time of the frame [s since the first scan].
             confirmed_s: Confirmation time of each tree of the frame, shape (T,) [s since the first scan], NaN
                 if unknown; None if all are unknown. A tree without a known time gets the event at `time_s`.
-            scans_s: Times of all scans up to the frame, shape (N,) [s since the first scan]. A time between
-                two of them that is longer than SILENT_S, and than two usual ones, is a silence. None in a
-                live run, see `silent`.
+            scans_s: Times of all scans up to the frame, shape (N,) [s since the first scan]. None in a
+                live run, where `silent` is called instead.
         """
         known = dict(self._events)
         passed = {key for key, event in self._before.items() if event.time_s <= time_s}
@@ -147,8 +146,9 @@ class Events:
             self._events[key] = replace(event, text=text)
 
     def _note_silences(self, scans_s: Float) -> None:
-        """Add the silences between the scans that came since the last call: times longer than SILENT_S and
-        than two usual ones, since some sensors give a scan in several seconds."""
+        """Add the silences between the scans that came since the last call. They are longer than SILENT_S,
+        and than twice the lower quartile of the times between scans, because some sensors scan every few
+        seconds."""
         new = scans_s[max(self._scans - 1, 0) :]
         self._scans = max(self._scans, len(scans_s))
         usual_s = np.percentile(np.diff(scans_s), 25, method="lower") if len(scans_s) > 1 else 0.0

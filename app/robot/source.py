@@ -19,6 +19,7 @@ from app.robot.velodyne import VelodyneLink
 from app.robot.zenoh import RosPublisher, ZenohLink
 from app.sources.live_address import (
     ALL_ROBOTS,
+    SILENT_S,
     Address,
     VelodyneAddress,
     ZenohAddress,
@@ -126,8 +127,6 @@ _POLL_S = 0.005
 _MOST_TOPICS = 10  # that a message lists
 #: Ends of the notices when the scans of a robot are not announced any more, and when they are again.
 GONE, BACK = "sends no scans any more", "sends scans again"
-#: A longer silence is reported [s]; a LiDAR of 5 Hz pauses for 0.2 s.
-SILENT_S = 1.0
 #: Path and trees are published and recorded at this interval [s]; the pose at every scan.
 _MAP_PAUSE_S = 1.0
 

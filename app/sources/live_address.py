@@ -16,6 +16,8 @@ from urllib.parse import parse_qsl
 from app.extension import all_extensions, switched_off
 from pipeline.errors import SourceError
 
+#: A longer time without a scan of a live source is reported [s]; a LiDAR of 5 Hz pauses for 0.2 s.
+SILENT_S = 1.0
 #: Value of `?robot=` for all robots, each with a dashboard.
 ALL_ROBOTS = "*"
 #: Value of `?robot=` for the robot without a namespace (ROS's root namespace).

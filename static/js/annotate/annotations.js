@@ -45,7 +45,7 @@ export const draft = {
   answered: [], // ids of the annotations of the last answers, the newest last
   error: "",
   refused: "", // why the last answer did not count
-  covers: false, // whether that stands over the picture
+  isRefusalShown: false, // for a while, over the picture
   refusals: 0, // answers in a row that did not count for that reason
   undo: {}, // numbers of edits that can be undone, by their subject
   redo: {},
@@ -358,18 +358,18 @@ async function answerIfSeen(tree, kind) {
 }
 
 const REFUSED_FOR = 5000; // [ms] as long as a message of the page: the picture below is to be looked at
+let uncovering = 0;
 
 // A reason that is repeated is counted, so that each refused key changes the text.
 function refuse(why) {
   draft.refusals = draft.refused.endsWith(`: ${why}.`) ? draft.refusals + 1 : 1;
   draft.refused = `Not counted${draft.refusals > 1 ? ` (${draft.refusals} times)` : ""}: ${why}.`;
   showNews(draft.refused);
-  draft.covers = true;
+  draft.isRefusalShown = true;
   clearTimeout(uncovering);
-  uncovering = setTimeout(() => { draft.covers = false; news(); }, REFUSED_FOR);
+  uncovering = setTimeout(() => { draft.isRefusalShown = false; news(); }, REFUSED_FOR);
   news();
 }
-let uncovering = 0;
 
 export const refusePlain = () => refuse("Shift+P answers “pole”; P alone has no action here");
 export const refuseHeld = () => refuse("a key that is held down answers once");

@@ -173,7 +173,7 @@ export function fillCard() {
   const tree = selectedTree();
   byId("review").classList.toggle("empty-card", !tree);
   byId("review-more").hidden = !tree;
-  byId("review-refused").hidden = !tree || !draft.refused || !draft.covers;
+  byId("review-refused").hidden = !tree || !draft.refused || !draft.isRefusalShown;
   setText(byId("review-refused"), draft.refused);
   if (!tree) {
     shown = "";

@@ -7,7 +7,7 @@ import { on, state } from "../core/store.js";
 import { parametersText } from "../playback/timeline.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { progressOf } from "../shell/status.js";
-import { forgetQuestion, mayLeave } from "./leaving.js";
+import { confirmLeaving, forgetQuestion } from "./leaving.js";
 import { completion, isListed, listPlaces, nearMisses, sift } from "./places.js";
 import { isLive, recordingOf, rememberRobot, showRobot, startRobotForm } from "./robot_form.js";
 import { chosenFor, startInside } from "./source_options.js";
@@ -75,7 +75,7 @@ export async function ask(uri) {
     return;
   }
   say("");
-  if (!await mayLeave()) return;
+  await confirmLeaving();
   requested = uri;
   left = state.status;
   setText(byId("source-open"), "Opening…");

@@ -10,17 +10,17 @@ const DOUBT = 20_000; // [ms] to read the question, which may come after an uplo
 // A live run that has scans in its map or its recording.
 const isLost = ({ live, state: phase, scan_index: scan, recorded_file: file }) => live && phase !== "finished" && (scan >= 0 || Boolean(file));
 
-// Resolves to true once another run may be opened; without an answer it does not resolve.
-export async function mayLeave() {
+// Resolves once another run may be opened: at once, or after a second press. A question without an answer does not resolve.
+export async function confirmLeaving() {
   const status = state.status ?? await get("/api/status");
-  if (!isLost(status)) return true;
+  if (!isLost(status)) return;
   const recorded = status.recording.startsWith("recording") ? status.recorded_file : "";
-  return new Promise((resolve) => {
+  await new Promise((resolve) => {
     const line = el("p", { id: "leaving", role: "alert" }, el("span", { text: `The robot's ${recorded ? "run and its recording end" : "run ends"}. Open anyway?` }),
       el("button", { type: "button", class: "small", text: "Open anyway", title: recorded && `The recording ${recorded} is completed`, onclick: () => press() }));
     const press = atSecondPress((asks) => (asks ? put(line) : line.remove()), () => {
       remember("left", recorded, "sessionStorage"); // the page names it once it is complete
-      resolve(true);
+      resolve();
     }, DOUBT);
     press();
   });

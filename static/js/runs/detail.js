@@ -4,7 +4,7 @@ import { get, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
 import { clock, count, figure, NONE } from "../core/format.js";
-import { mayLeave } from "../open/leaving.js";
+import { confirmLeaving } from "../open/leaving.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";
 import { ofExtensions } from "../shell/extensions.js";
@@ -75,7 +75,7 @@ function head(run, { replay, rename, remove }) {
 
 // The files of a live run; a press opens one in the dashboard.
 function recordings({ live, map: { recordings: files } }, guarded) {
-  const show = (uri) => guarded(async () => { if (!await mayLeave()) return; await open({ uri }); location.href = "/"; });
+  const show = (uri) => guarded(async () => { await confirmLeaving(); await open({ uri }); location.href = "/"; });
   return el("p", { class: "dim row", id: "run-recordings", hidden: !live || !files, text: files?.length ? "Recorded to" : "Not recorded" }, ...(files ?? []).map((file) =>
     el("button", { class: "small", "data-edit": true, text: file.split(/[/\\]/).pop(), title: `${file}\nOpen this recording in the dashboard`, onclick: show(file) })));
 }

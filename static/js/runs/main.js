@@ -6,7 +6,7 @@ import { count, figure, NONE, percent } from "../core/format.js";
 import { startAccess } from "../core/permissions.js";
 import { on } from "../core/store.js";
 import { startTheme } from "../core/theme.js";
-import { mayLeave } from "../open/leaving.js";
+import { confirmLeaving } from "../open/leaving.js";
 import { startUpload } from "../open/upload.js";
 import { ofExtensions, startExtensions } from "../shell/extensions.js";
 import { repaint, say, showRun } from "./detail.js";
@@ -106,7 +106,7 @@ function follow() {
 }
 
 async function replay(run) {
-  if (!await mayLeave()) return;
+  await confirmLeaving();
   await post(`/api/runs/${encodeURIComponent(run.key)}/replay`, {});
   location.href = "/";
 }
@@ -156,7 +156,7 @@ addEventListener("focus", load);
 setInterval(() => { if (!waiting && !document.hidden && !byId("runs").contains(document.activeElement)) load(); }, REFRESH_EVERY);
 on("theme", repaint);
 startUpload(async ({ uri }) => {
-  if (!await mayLeave()) return;
+  await confirmLeaving();
   await open({ uri });
   location.href = "/";
 });

@@ -6,7 +6,7 @@ import { clock, count } from "../core/format.js";
 import { access, endViewerLink, looksOnly, refreshAccess, startAccess } from "../core/permissions.js";
 import { attempted, showProblem } from "../core/problem.js";
 import { on, state } from "../core/store.js";
-import { mayLeave } from "../open/leaving.js";
+import { confirmLeaving } from "../open/leaving.js";
 import { controlOf, sentOf } from "../scene/viser_client.js";
 
 const PATIENCE = 120_000; // [ms] for a run to open
@@ -113,7 +113,7 @@ async function follow() {
   try {
     const source = { uri: run, ...optionsOf(options) };
     if (!isOpen(source)) {
-      if (!await mayLeave()) return;
+      await confirmLeaving();
       await open(source);
     }
     if (!await until(() => state.status?.source === run && state.status.scan_index >= 0)) return;

@@ -374,9 +374,9 @@ async def test_annotations_lie_over_the_truth_of_the_source() -> None:
         assert dashboard.annotation_editor.as_plain()["used"] == "both"
         # The truth says itself what is annotated: the message with the annotations comes later.
         messages = [json.loads(each) for _, each in dashboard.live.messages_after(0)]
-        told = next(each for each in messages if each["type"] == "truth")
-        assert [each.get("annotated", False) for each in told["trees"]] == [False, False, True]
-        assert not told["trees"][2]["taped"]
+        truth = next(each for each in messages if each["type"] == "truth")
+        assert [each.get("annotated", False) for each in truth["trees"]] == [False, False, True]
+        assert not truth["trees"][2]["taped"]
         await edit(client, "POST", "/undo")
         assert dashboard.truth.x.tolist() == [0.05, 2.0, 9.0]
 
