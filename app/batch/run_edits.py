@@ -48,20 +48,20 @@ def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Conte
     """Return a dict from the number of each reviewed tree to its review: CONFIRMED for the class "tree",
     REJECTED for another class, SKIPPED if no annotation of the tree states a class.
 
-    A tree has at most one annotation. It is one to which no other tree is nearer, and nearer than SAME_THING:
-    the nearest one that states a class, of equally near ones the last. The others belong to no tree. The page
-    has the same rule (`paired` in static/js/annotate/annotations.js).
+    A tree has at most one annotation. It is one to which no other tree is nearer, and nearer than its reach
+    (SAME_THING if it has none): the nearest one that states a class, of equally near ones the last. The
+    others belong to no tree. The page has the same rule (`paired` in static/js/annotate/annotations.js).
 
     Args:
         numbers, position: Numbers of the trees, and their positions in the map, shape (T, 2) [m].
         contents: The annotations in the same frame; plots and frames are ignored.
     """
     reviews = [content for content in contents if content.kind in _STATES]
-    of_tree = _annotation_of_tree(position, reviews)
+    of_tree = annotation_of_tree(position, reviews)
     return {numbers[row]: _STATES[reviews[k].kind] for row, k in of_tree.items()}
 
 
-def _annotation_of_tree(position: Float, reviews: Sequence[Content]) -> dict[int, int]:
+def annotation_of_tree(position: Float, reviews: Sequence[Content]) -> dict[int, int]:
     """Return a dict from the row of each tree that has an annotation to the index of it, see `reviews_of`."""
     from scipy.spatial import cKDTree
 
@@ -70,7 +70,27 @@ def _annotation_of_tree(position: Float, reviews: Sequence[Content]) -> dict[int
     distance, row = cKDTree(position).query([(content.x, content.y) for content in reviews])
     states_class = np.array([content.kind != SKIPPED for content in reviews])
     order = np.lexsort((-distance, states_class))  # the one that counts comes last
-    return {int(row[k]): int(k) for k in order if distance[k] < SAME_THING}
+    reach = [SAME_THING if content.reach is None else content.reach for content in reviews]
+    return {int(row[k]): int(k) for k in order if distance[k] < reach[k]}
+
+
+def reach_at(position: Float, place: tuple[float, float]) -> float | None:
+    """Return the distance below which an annotation that is made now can be about a mapped tree [m]; None for
+    SAME_THING.
+
+    An annotation is about the tree at its place. If a later map lacks that tree, the annotation must not be
+    taken for one of its neighbour, which was there before. The boundary is half-way between the distances of
+    both.
+
+    Args:
+        position: Positions of the trees that are mapped now, shape (T, 2) [m].
+        place: Position of the annotation [m].
+    """
+    nearest = np.sort(np.hypot(*(position - place).T))[:2]
+    if len(nearest) < 2 or nearest[0] >= SAME_THING:
+        return None
+    reach = float(nearest.mean())
+    return reach if reach < SAME_THING else None
 
 
 def measured_by_people(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> ByPeople:
@@ -82,7 +102,7 @@ def measured_by_people(numbers: Sequence[int], position: Float, contents: Iterab
         numbers, position, contents: See `reviews_of`.
     """
     reviews = [content for content in contents if content.kind in _STATES]
-    of_tree = _annotation_of_tree(position, reviews)
+    of_tree = annotation_of_tree(position, reviews)
     stated = as_truth(reviews)
     is_tree = np.array([content.kind == "tree" for content in reviews], np.bool_)
     measured = is_tree & np.isfinite(stated.dbh)

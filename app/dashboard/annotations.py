@@ -109,21 +109,21 @@ def laid_over(own: TruthTrees | None, contents: Sequence[Content]) -> TruthTrees
     )
 
 
-def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
-    """Return the number of annotations whose class differs from that of their object of the source.
+def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> list[int]:
+    """Return the ids of the annotations whose class differs from that of their object of the source.
 
     Annotations and objects are matched one to one within SAME_THING, see `pipeline.evaluation.match`; the
     object of an annotation is therefore not always the nearest one. Annotations without an object do not
     count.
 
     Args:
-        own: Ground truth of the source; None if there is none, then the result is 0.
+        own: Ground truth of the source; None if there is none, then the result is [].
         rows: The annotations.
     """
     if own is None or not rows or not len(own.x):
-        return 0
+        return []
     near = zip(_nearest(own, [row.content for row in rows]).tolist(), rows, strict=True)
-    return sum(k >= 0 and own.kind[k] != row.content.kind for k, row in near)
+    return [row.id for k, row in near if k >= 0 and own.kind[k] != row.content.kind]
 
 
 def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
@@ -139,7 +139,7 @@ def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
         return content
     known = float(own.dbh[k])
     dbh = content.dbh if content.dbh is not None or np.isnan(known) else known
-    return Content(float(own.x[k]), float(own.y[k]), content.kind, dbh)
+    return replace(content, x=float(own.x[k]), y=float(own.y[k]), dbh=dbh)
 
 
 def _nearest(own: TruthTrees, contents: Sequence[Content]) -> NDArray[np.int64]:
@@ -392,7 +392,8 @@ class ImportPlan:
 
     Attributes:
         added: Contents of new annotations.
-        filled: Id, version and new content of each annotation that gets a DBH.
+        filled, replaced: Id, version and new content of each annotation that gets a DBH, and of each one
+            whose class or DBH is replaced.
         conflicts: The annotation and the row that contradicts it, of each row that is left out for that.
         repeated: Number of rows that say nothing new.
         beside: Distance between row and annotation [m], of each row that is about an annotation but not at
@@ -401,22 +402,27 @@ class ImportPlan:
 
     added: list[Content]
     filled: list[tuple[int, int, Content | None]]
+    replaced: list[tuple[int, int, Content | None]]
     conflicts: list[tuple[Content, Content]]
     repeated: int
     beside: list[float]
 
 
-def import_plan(rows: Sequence[Annotation], contents: Sequence[Content]) -> ImportPlan:
+def import_plan(
+    rows: Sequence[Annotation], contents: Sequence[Content], *, replaces: bool = False
+) -> ImportPlan:
     """Return what an import of a table does.
 
     A row within SAME_THING of an annotation is about the same object, and adds no second annotation; only the
     nearest row is about it, so that two stems of a table stay two. A row at the place of an earlier row is
     about the object of that row. A row gives its DBH to an annotation of the same class without DBH. With
-    another class or another DBH it is a conflict, and nothing is stored.
+    another class or another DBH it is a conflict, and nothing is stored, unless it replaces an annotation.
 
     Args:
         rows: The annotations of objects.
         contents: The rows of the table in the frame of the map.
+        replaces: Whether a row replaces the class and the DBH of its annotation, as after a correction of an
+            exported table elsewhere. An annotation keeps a DBH that the row lacks.
     """
     from scipy.spatial import cKDTree
 
@@ -424,7 +430,7 @@ def import_plan(rows: Sequence[Annotation], contents: Sequence[Content]) -> Impo
     at = cKDTree(np.array([(each.x, each.y) for each in known]).reshape(-1, 2))
     same = _same_things(known, len(rows))
     object_of = {j: j for j in range(len(rows))} | {k: j for k, (j, _) in same.items()}
-    filled, conflicts = set[int](), list[tuple[Content, Content]]()
+    filled, replaced, conflicts = set[int](), set[int](), list[tuple[Content, Content]]()
     for k, content in enumerate(contents, start=len(rows)):
         if k not in same:
             near = at.query_ball_point((content.x, content.y), _SAME_PLACE)
@@ -432,19 +438,26 @@ def import_plan(rows: Sequence[Annotation], contents: Sequence[Content]) -> Impo
             object_of[k] = min(objects, key=lambda j: (known[j].kind != content.kind, j), default=k)
         j = object_of[k]
         here = known[j]
-        if here.kind != content.kind:
-            conflicts.append((here, content))
+        is_other_dbh = (
+            here.dbh is not None and content.dbh is not None and abs(here.dbh - content.dbh) > _SAME_DBH
+        )
+        if here.kind != content.kind or is_other_dbh:
+            if replaces and j < len(rows) and j not in replaced:
+                known[j] = replace(here, kind=content.kind, dbh=content.dbh or here.dbh)
+                replaced.add(j)
+            else:
+                conflicts.append((here, content))
         elif here.dbh is None and content.dbh is not None:
             known[j] = replace(here, dbh=content.dbh)
             filled.add(j)
-        elif here.dbh is not None and content.dbh is not None and abs(here.dbh - content.dbh) > _SAME_DBH:
-            conflicts.append((here, content))
     added = [known[j] for j in range(len(rows), len(known)) if object_of[j] == j]
-    changed = list[tuple[int, int, Content | None]]()
-    changed += [(row.id, row.version, known[j]) for j, row in enumerate(rows) if j in filled]
-    repeated = len(contents) - len(added) - len(changed) - len(conflicts)
+    edits: list[list[tuple[int, int, Content | None]]] = [
+        [(row.id, row.version, known[j]) for j, row in enumerate(rows) if j in of]
+        for of in (filled - replaced, replaced)
+    ]
+    repeated = len(contents) - len(added) - len(filled | replaced) - len(conflicts)
     beside = [distance for _, distance in same.values() if distance > _SAME_PLACE]
-    return ImportPlan(added, changed, conflicts, repeated, beside)
+    return ImportPlan(added, edits[0], edits[1], conflicts, repeated, beside)
 
 
 def _same_things(known: Sequence[Content], number: int) -> dict[int, tuple[int, float]]:
@@ -644,8 +657,8 @@ def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[s
 
 def row_payload(row: Annotation) -> dict[str, Any]:
     """Return an annotation of an object as a dict of JSON values for the dashboard: `id`, `x` and `y` in the
-    map [m], `kind`, `dbh_cm` (None if unknown), `who`, `at_s` (time of the last edit [s since 1970], to
-    the millisecond) and `version`."""
+    map [m], `kind`, `dbh_cm` (None if unknown), `reach_m` (see `Content`, SAME_THING if it has none), `who`,
+    `at_s` (time of the last edit [s since 1970], to the millisecond) and `version`."""
     content = row.content
     return {
         "id": row.id,
@@ -653,6 +666,7 @@ def row_payload(row: Annotation) -> dict[str, Any]:
         "y": round(content.y, 4),
         "kind": content.kind,
         "dbh_cm": None if content.dbh is None else round(100.0 * content.dbh, 2),
+        "reach_m": SAME_THING if content.reach is None else round(content.reach, 4),
         "who": row.who,
         "at_s": round(row.at_ns / 1e9, 3),
         "version": row.version,

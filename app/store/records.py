@@ -51,6 +51,8 @@ class Content:
         dbh: Diameter at breast height [m], None if not measured.
         values: JSON values of a FRAME, with the record of a `MapFrame` as `frame`, of a REPAIR, with the
             fields of `Repair`, and of classes of extensions; None for KINDS and SKIPPED.
+        reach: Distance below which it can be about a mapped tree [m], because trees beyond were other ones
+            when it was made; None if no other one was near, see `run_edits.reach_at`.
     """
 
     x: float
@@ -58,6 +60,7 @@ class Content:
     kind: str = "tree"
     dbh: float | None = None
     values: dict[str, Any] | None = None
+    reach: float | None = None
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:

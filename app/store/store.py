@@ -874,17 +874,19 @@ def _columns(content: Content) -> dict[str, Any]:
         "kind": content.kind,
         "dbh": content.dbh,
         "plot": content.values,
+        "reach": content.reach,
     }
 
 
 def _content(row: Row[Any]) -> Content:
     """Return the content of the row of an annotation."""
-    return Content(row.x, row.y, row.kind, row.dbh, row.plot)
+    return Content(row.x, row.y, row.kind, row.dbh, row.plot, row.reach)
 
 
 def _as_content(columns: dict[str, Any]) -> Content:
     """Return the content whose `_columns` these are."""
-    return Content(columns["x"], columns["y"], columns["kind"], columns["dbh"], columns["plot"])
+    place = columns["x"], columns["y"]
+    return Content(*place, columns["kind"], columns["dbh"], columns["plot"], columns.get("reach"))
 
 
 def _key(source: str) -> str:

@@ -799,9 +799,21 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     field.fill("2.6")
     field.press("Enter")
     mapped = f"{first['dbh_cm']:.1f} ± {first['sigma_dbh_cm']:.1f}"
-    expect(last.locator("span")).to_have_text(
-        f"Tree {first['number']}: tree, 2.6 cm; the map has {mapped} cm. Was it typed in cm?"
+    asked = "Press Enter again to store 2.6 cm, Escape to restore it."
+    said = f"The map has {mapped} cm. Was it typed in cm? {asked}"
+    expect(page.locator("#review-dbh-error")).to_have_text(said)
+    expect(field).to_be_focused()
+    page.locator("#review-title").click()  # who goes on without the second Enter has not confirmed it
+    expect(page.locator("#problem")).to_contain_text(
+        f"The DBH 2.6 cm of tree {first['number']} was not stored."
     )
+    expect(field).to_have_value("")
+    assert not rows(person)
+    person.answer("d")
+    field.fill("2.6")
+    field.press("Enter")
+    field.press("Enter")
+    expect(last.locator("span")).to_have_text(f"Tree {first['number']}: tree, 2.6 cm")
     page.evaluate(select, second["number"])
     person.answer("d")
     field.fill(str(second["dbh_cm"]))
@@ -1061,10 +1073,9 @@ def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser,
         person.page.locator("#annotate-asked").fill("Ann")
         person.page.locator("#annotate-asked").press("Enter")
         person.answer("y")
-        expect(person.page.locator("#annotate-count")).to_contain_text("2 of")
+        person.until_server("/api/annotations", "it.trees.length === 2")  # the page counts those on their way
         before = rows(person)
         first.kill()
-    assert len(before) == 2
     with Server(STEMMAP_FOLDER=str(tmp_path)) as again, opened(chromium, again.link) as other:
         page = other.page
         panel = other.tab("Annotate")
@@ -1209,6 +1220,15 @@ def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_nam
     )
     assert len(rows(person)) == len(trees)
     assert rows(person)[0]["dbh_cm"] == 31.5
+    page.locator("#annotate-replaces").check()
+    file.set_input_files({"name": "plot.csv", "mimeType": "text/csv", "buffer": table.encode()})
+    expect(hint).to_contain_text(
+        f"0 trees imported from plot.csv; 1 annotation replaced; {len(trees) - 1} left"
+    )
+    assert rows(person)[1]["kind"] == "pole"
+    page.locator("#annotate-replaces").uncheck()
+    page.locator("#annotate-undo").click()
+    expect(page.locator("#annotate-rejected")).to_have_text("0 rejected")
     beside = f"x_m,y_m\n{trees[0]['x'] + 0.02},{trees[0]['y']}\n"
     file.set_input_files({"name": "gnss.csv", "mimeType": "text/csv", "buffer": beside.encode()})
     expect(hint).to_contain_text("1 row lies 0.020 m beside an annotation and counts as the same object")
@@ -1216,6 +1236,55 @@ def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_nam
     expect(page.locator("#problem")).to_contain_text(f"Undone: DBH of tree {trees[0]['number']} set to 31.5")
     page.locator("#annotate-undo").click()
     expect(page.locator("#problem")).to_contain_text(f"Undone: {len(trees)} annotations added.")
+
+
+# A later map in which the tree of an annotation is gone, and another one is 0.3 m from its place.
+WITHOUT_OWN_TREE = """async ([number, reach]) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const { reviewOf, withoutTree } = await import('/static/js/annotate/annotations.js');
+  const { map, annotations } = state, [row] = annotations.trees;
+  const beside = { ...map.trees.find((tree) => tree.number !== number), x: row.x + 0.3, y: row.y };
+  state.map = { ...map, trees: [beside] };
+  state.annotations = { ...annotations, trees: [{ ...row, reach_m: reach }] };
+  changed('map');
+  changed('annotations');
+  const said = document.querySelector('#annotate-without');
+  return [reviewOf(beside), withoutTree().length, said.hidden ? '' : said.innerText.trim().split('\\n')[0]];
+}"""
+
+
+def test_a_rejection_does_not_pass_to_a_neighbour_when_its_tree_is_gone(person: Dashboard):
+    tree = doubted(person)[0]
+    person.page.evaluate(
+        "number => import('/static/js/core/live_feed.js').then(it => it.select(number))", tree["number"]
+    )
+    person.answer("Shift+P")
+    person.until_server("/api/annotations", "it.trees.length === 1")
+    assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.5]) == ["rejected", 0, ""]
+    said = "1 answer belongs to no tree of this map, so it decides nothing:"
+    assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.25]) == ["open", 1, said]
+
+
+def test_an_answer_that_replaces_that_of_another_person_says_so(
+    person: Dashboard, chromium: Browser, server: Server
+):
+    number = doubted(person)[0]["number"]
+    select = "number => import('/static/js/core/live_feed.js').then(it => it.select(number))"
+    person.page.locator("#annotate-asked").fill("Ann")
+    person.page.locator("#annotate-asked").press("Enter")
+    person.page.evaluate(select, number)
+    person.answer("y")
+    person.until_server("/api/annotations", "it.trees.length === 1")
+    with opened_by_another(chromium, server.link) as other:
+        other.tab("Annotate")
+        other.page.evaluate(select, number)
+        expect(other.page.locator("#review-state")).to_have_text("confirmed by Ann")
+        other.answer("Shift+P")
+        expect(other.page.locator("#review-last span")).to_have_text(
+            f"Tree {number}: pole (before: tree by Ann)"
+        )
+        assert other.errors == []
+    assert person.errors == []
 
 
 def test_the_map_names_the_filter_that_makes_it_pale_and_removes_it(person: Dashboard):

@@ -144,3 +144,30 @@ def test_a_stored_layout_that_is_not_one_is_ignored(wide: Dashboard):
         expect(page.locator("section.map")).to_be_visible()
         assert box(page.locator("section.map"))["width"] >= 0.14 * WIDTH
     page.evaluate("localStorage.removeItem('stemmap.layout')")
+
+
+def test_the_scene_can_be_hidden_and_comes_back_with_what_lies_over_it(wide: Dashboard):
+    page = wide.page
+    scene, plan = page.locator("section.scene"), page.locator("#map")
+    wide.tab("Annotate")
+    page.locator("#layout-button").click()
+    page.locator("#layout-scene").uncheck()
+    page.locator("body").press("Escape")
+    expect(scene).not_to_be_visible()
+    assert box(page.locator("#panel-annotate"))["height"] > 0.6 * HEIGHT
+    assert box(plan)["width"] > 0.4 * WIDTH
+    page.reload()
+    wide.pause()
+    expect(scene).not_to_be_visible()
+    page.locator("body").press("c")  # A | B lies over the scene
+    expect(scene).to_be_visible()
+    expect(page.locator("#over-compare")).to_be_visible()
+    page.locator("body").press("Escape")
+
+    # One part is always there.
+    page.locator("#layout-button").click()
+    for part in ("map", "tabs", "scene"):
+        page.locator(f"#layout-{part}").click()
+    expect(page.locator("#layout-scene")).to_be_checked()
+    for part in ("map", "tabs"):
+        page.locator(f"#layout-{part}").check()

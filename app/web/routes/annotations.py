@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import re
 from dataclasses import replace
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
+from app.batch.run_edits import annotation_of_tree, reach_at
 from app.dashboard.annotations import Against, carried_back, import_plan, row_payload
 from app.dashboard.dashboard import Dashboard
 from app.store.records import MOST_ANNOTATIONS, REPAIR, Author, Content, contents_of, moment
@@ -20,11 +22,12 @@ from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
 from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
 from pipeline.errors import SourceError
-from pipeline.repairs.record import Repair, numbers_at
+from pipeline.repairs.record import Repair
 
 router = APIRouter(prefix="/api")
 
 _LARGEST_DBH_M = 10.0
+_SAME_PLACE_M = 0.001  # the page states places to 0.1 mm
 _MOST_NAMED = 3  # contradictions of an import that are named
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
 
@@ -56,9 +59,11 @@ class _Turn(Edit):
 
 
 class _ImportTable(Edit):
-    """A table of trees as text; `dbh_unit` is the unit of a column `dbh` whose header does not name it."""
+    """A table of trees as text; `dbh_unit` is the unit of a column `dbh` whose header does not name it. With
+    `replaces` a row replaces the class and the diameter of its annotation, see `import_plan`."""
 
     table: Annotated[str, Field(max_length=1_000_000)]
+    replaces: bool = False
     dbh_unit: Literal["m", "cm", "mm"] | None = None
 
 
@@ -84,7 +89,8 @@ async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
     """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
     and not exported); return its number (`id`) and the counts of edits, see `edited`, with 201. 409 if
     another run was opened meanwhile, nothing can be annotated, or the run has MOST_ANNOTATIONS."""
-    (added,) = await apply_edit(dashboard, body, Store.add, [body.content])
+    content = replace(body.content, reach=_reach_at(dashboard, body))
+    (added,) = await apply_edit(dashboard, body, Store.add, [content])
     return await edited(dashboard, body, {"id": added}, 201)
 
 
@@ -92,7 +98,13 @@ async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
 async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Response:
     """Change an annotation; 409 if it does not have this version any more or another run was opened, 404 for
     an unknown one. Return its number (`id`) and the counts of edits, see `edited`."""
-    await apply_edit(dashboard, body, Store.change, number, body.version, body.content)
+    editor = dashboard.annotation_editor
+    before = next((row.content for row in [*editor.rows, *editor.skipped] if row.id == number), None)
+    if before is not None and math.dist((body.x, body.y), (before.x, before.y)) < _SAME_PLACE_M:
+        content = replace(body.content, reach=before.reach)
+    else:
+        content = replace(body.content, reach=_reach_at(dashboard, body))
+    await apply_edit(dashboard, body, Store.change, number, body.version, content)
     return await edited(dashboard, body, {"id": number})
 
 
@@ -133,22 +145,24 @@ async def redo(body: _Turn, dashboard: Dash) -> Response:
 @router.post("/annotations/import")
 async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     """Add the rows of a CSV table, and the diameters that annotations lack, in one edit, see `import_plan`.
-    Return the number of added annotations (`added`), of diameters added to others (`filled`), of rows that
-    exist already as annotations or earlier in the table (`left_out`), and of rows that are left out because
-    they contradict an annotation (`differing`), with the first of these as text (`differences`); of rows that
-    are not exactly at the place of their annotation (`beside`), with the smallest and the largest distance
-    (`beside_m`); and the counts of edits, see `edited`. 422 if the table cannot be read, has a row out of
-    bounds or too many rows, 409 as in `add`; then nothing is added. Without new rows and diameters there is
-    no edit."""
+    Return the number of added annotations (`added`), of diameters added to others (`filled`), of annotations
+    whose class or diameter is replaced (`replaced`), of rows that exist already as annotations or earlier in
+    the table (`left_out`), and of rows that are left out because they contradict an annotation (`differing`),
+    with the first of these as text (`differences`); of rows that are not exactly at the place of their
+    annotation (`beside`), with the smallest and the largest distance (`beside_m`); and the counts of edits,
+    see `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows, 409 as in `add`;
+    then nothing is stored. Without anything new there is no edit."""
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
     contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
-    plan = import_plan(dashboard.annotation_editor.rows, contents)
-    if plan.added or plan.filled:
-        await apply_edit(dashboard, body, Store.edit, plan.added, plan.filled)
+    plan = import_plan(dashboard.annotation_editor.rows, contents, replaces=body.replaces)
+    changed = [*plan.filled, *plan.replaced]
+    if plan.added or changed:
+        await apply_edit(dashboard, body, Store.edit, plan.added, changed)
     payload = {
         "added": len(plan.added),
         "filled": len(plan.filled),
+        "replaced": len(plan.replaced),
         "left_out": plan.repeated,
         "differing": len(plan.conflicts),
         "differences": [_difference(dashboard, *pair) for pair in plan.conflicts[:_MOST_NAMED]],
@@ -197,26 +211,37 @@ async def export_geojson(dashboard: Dash) -> Response:
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     """Return the annotations of objects of the open run as dicts, see `row_payload`, with `tree`, the number
-    of the nearest tree within half a metre in the map of the shown scan, None for none; for a run of one
-    step, in the coordinates of its file."""
+    of the tree that it is about in the map of the shown scan, None for none; for a run of one step, in the
+    coordinates of its file."""
     x, y = dashboard.offset
-    rows = [row_payload(row) for row in dashboard.annotation_editor.rows]
-    return [
-        {**row, "x": row["x"] + x, "y": row["y"] + y, "tree": _tree_at(dashboard, row["x"], row["y"])}
-        for row in rows
-    ]
+    tree_of = _trees_of(dashboard)
+    rows = [(row_payload(row), tree_of.get(row.content)) for row in dashboard.annotation_editor.rows]
+    return [{**row, "x": row["x"] + x, "y": row["y"] + y, "tree": tree} for row, tree in rows]
 
 
-def _tree_at(dashboard: Dashboard, x: float, y: float) -> int | None:
-    """Return the number of the tree of the map that an annotation at x, y [m] is about, None for none."""
+def _reach_at(dashboard: Dashboard, body: _AddAnnotation) -> float | None:
+    """Return the reach of an annotation in the map of the shown scan, see `reach_at`."""
     if dashboard.shown is None:
         return None
-    return next(iter(numbers_at(dashboard.shown.frame.trees, [(x, y)], confirmed=True)), None)
+    trees = dashboard.shown.frame.trees
+    return reach_at(trees.position[trees.confirmed], (body.x, body.y))
+
+
+def _trees_of(dashboard: Dashboard) -> dict[Content, int]:
+    """Return a dict from each annotation that is about a tree of the map of the shown scan to the number of
+    that tree, see `reviews_of`."""
+    if dashboard.shown is None:
+        return {}
+    trees = dashboard.shown.frame.trees
+    contents = [row.content for row in dashboard.annotation_editor.rows]
+    of_tree = annotation_of_tree(trees.position[trees.confirmed], contents)
+    numbers = trees.number[trees.confirmed].tolist()
+    return {contents[k]: numbers[row] for row, k in of_tree.items()}
 
 
 def _difference(dashboard: Dashboard, here: Content, there: Content) -> str:
     """Return how a row of a table (`there`) contradicts the annotation at its place."""
-    number = _tree_at(dashboard, here.x, here.y)
+    number = _trees_of(dashboard).get(here)
     x, y = dashboard.offset
     name = f"the annotation at {here.x + x:.2f}, {here.y + y:.2f}" if number is None else f"tree {number}"
     if here.kind != there.kind:

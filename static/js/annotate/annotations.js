@@ -240,19 +240,20 @@ function changeText({ was, is }, tree) {
   if (is.dbh_cm !== was.dbh_cm) return `DBH of ${name} ${is.dbh_cm === null ? "removed" : `set to ${is.dbh_cm} cm`}`;
   return `${name} moved`;
 }
-export const importTable = (table, unit) => edit(() => call("POST", "/import", { table, dbh_unit: unit || null }));
+export const importTable = (table, unit, replaces) => edit(() => call("POST", "/import", { table, replaces, dbh_unit: unit || null }));
 
 // --- review of the found trees -------------------------------------------------------------------------------
 
 // {ofTree, treeOf}: the annotation of each found tree by its number, and the number of the tree of each annotation by its id.
 // Of the annotations to which a found tree is the nearest one, the nearest that states something belongs to it; the others belong to none.
+// An annotation reaches no tree that was another one when it was made.
 const pairs = { map: null, annotations: null, ofTree: new Map(), treeOf: new Map() };
 
 function paired() {
   if (pairs.map === state.map && pairs.annotations === state.annotations) return pairs;
   Object.assign(pairs, { map: state.map, annotations: state.annotations, ofTree: new Map(), treeOf: new Map() });
   for (const row of [...skips(), ...rows()]) {
-    const tree = nearest(trees(), (each) => distance(row, each), state.annotations.same_thing_m);
+    const tree = nearest(trees(), (each) => distance(row, each), row.reach_m);
     if (!tree) continue;
     const other = pairs.ofTree.get(tree.number);
     if (!other || other.kind === SKIPPED || distance(row, tree) <= distance(other, tree)) pairs.ofTree.set(tree.number, row);
@@ -263,6 +264,12 @@ function paired() {
 
 export const annotationOf = (tree) => paired().ofTree.get(tree.number) ?? null;
 export const treeNumberOf = (row) => paired().treeOf.get(row.id) ?? null;
+
+// Answers that a thing is no tree, whose thing is not in this map: they decide nothing.
+export const withoutTree = () => rows().filter((row) => row.kind !== "tree" && treeNumberOf(row) === null);
+
+// The answer nearest to an open tree that was given for another thing; null without one.
+export const answerBeside = (tree) => nearest(withoutTree(), (row) => distance(row, tree), state.annotations.same_thing_m);
 
 // One of STATES.
 export function reviewOf(tree) {
@@ -392,7 +399,7 @@ export const byClick = (answers) => (event) => {
 
 async function answer(tree, kind, fields = {}, goesOn = true) {
   const { number } = tree, seen = annotationOf(tree), run = state.annotations?.run;
-  const { dbh_cm = null } = { ...seen, ...fields }, given = answerOf(tree, kind, dbh_cm);
+  const { dbh_cm = null } = { ...seen, ...fields }, given = { ...answerOf(tree, kind, dbh_cm), before: seen, isAsked: "dbh_cm" in fields };
   Object.assign(draft, { kind: null, refused: "" });
   if (seen && Object.entries({ kind, ...fields }).every(([name, value]) => seen[name] === value)) {
     draft.answer = { ...given, isStored: true };
@@ -504,8 +511,19 @@ const statement = (kind, dbh) => (dbh === null ? kind : `${kind}, ${dbh} cm`);
 export function answerText() {
   if (!draft.answer) return "";
   const { number, kind, dbh, isStored } = draft.answer;
-  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${dbhDoubt(draft.answer)}`;
+  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${replacedText(draft.answer)}${draft.answer.isAsked ? "" : dbhDoubt(draft.answer)}`;
 }
+
+// The answer that this one replaced, with the name of another person.
+function replacedText({ before, kind, isStored }) {
+  if (isStored || !before || [SKIPPED, kind].includes(before.kind)) return "";
+  return ` (before: ${before.kind}${byOther(before)})`;
+}
+
+export const byOther = (row) => (row.who === myName() ? "" : ` by ${row.who}`);
+
+// Why a DBH that is typed for a found tree [cm] is doubtful; "" if it is not.
+export const typedDoubt = (tree, dbh) => dbhDoubt(answerOf(tree, "tree", dbh)).replace("; the", "The");
 
 // A typed diameter that differs from that of the map by more than chance is often one in another unit.
 function dbhDoubt({ dbh, mapped, sigma }) {
@@ -575,10 +593,12 @@ export function truthText() {
 }
 
 export function contradictionText() {
-  const { contradicting = 0, used } = state.annotations ?? {};
-  if (!contradicting || used !== "both") return "";
-  return `${count(contradicting, "annotation")} ${contradicting === 1 ? "contradicts" : "contradict"} the ground truth of this run and ${contradicting === 1 ? "replaces" : "replace"} it there.`;
+  const number = contradicting().length;
+  return number ? `${count(number, "annotation")} ${number === 1 ? "contradicts" : "contradict"} the ground truth of this run and ${number === 1 ? "replaces" : "replace"} it there:` : "";
 }
+
+// The annotations that contradict the ground truth of the run where both are used.
+export const contradicting = () => (state.annotations?.used === "both" ? state.annotations.contradicting.map(rowOf).filter(Boolean) : []);
 
 export const scoreAgainst = (against) => attempted(() => put("/api/annotations/against", { against }));
 

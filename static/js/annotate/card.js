@@ -3,13 +3,14 @@
 import { get } from "../core/api.js";
 import { button, byId, el, setText } from "../core/dom.js";
 import { capital, figure } from "../core/format.js";
+import { showNews } from "../core/problem.js";
 import { on, selectedTree, state, treeOf } from "../core/store.js";
 import { keepFresh, throttled } from "../core/timing.js";
 import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { openTab } from "../shell/tabs.js";
-import { annotating, annotationOf, askForTree, draft, following, measureDbh, news, reviewOf, showCard, typedDbh } from "./annotations.js";
+import { annotating, annotationOf, askForTree, byOther, draft, following, measureDbh, news, reviewOf, showCard, typedDbh, typedDoubt } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
@@ -105,7 +106,25 @@ const again = throttled(refresh, EVERY);
 // The selection may have changed when a person leaves the field: its DBH belongs to the tree that the field shows.
 function takeDbh({ target }) {
   const tree = treeOf(Number(target.dataset.tree)), dbh = checkedDbh(target);
-  if (tree && dbh !== undefined) measureDbh(tree, dbh, isEntered);
+  if (!tree || dbh === undefined) return;
+  const doubt = isEntered ? "" : typedDoubt(tree, dbh); // Enter has asked
+  if (doubt) {
+    showDbh(tree);
+    showNews(`The DBH ${dbh} cm of tree ${tree.number} was not stored. ${doubt} Type it again and press Enter twice to store it.`);
+  } else {
+    measureDbh(tree, dbh, isEntered);
+  }
+}
+
+// Returns whether a doubtful DBH is to be confirmed by a second Enter.
+function isQuestioned(input, tree) {
+  const dbh = checkedDbh(input), doubt = tree && dbh !== undefined ? typedDoubt(tree, dbh) : "";
+  if (!doubt || input.dataset.asked === input.value) return false;
+  input.dataset.asked = input.value;
+  input.setAttribute("aria-invalid", "true");
+  setText(byId("review-dbh-error"), `${doubt} Press Enter again to store ${dbh} cm, Escape to restore it.`);
+  byId("review-dbh-error").scrollIntoView({ block: "nearest" });
+  return true;
 }
 
 // A text that cannot be read as a DBH stays in the field, with the error beside it.
@@ -126,7 +145,7 @@ function endDbh(event) {
   event.preventDefault();
   draft.error = "";
   if (key === "Escape") showDbh(tree);
-  else if (checkedDbh(target) === undefined) return;
+  else if (checkedDbh(target) === undefined || isQuestioned(target, tree)) return;
   isEntered = key === "Enter";
   target.blur(); // calls takeDbh if the text was changed
   isEntered = false;
@@ -145,6 +164,7 @@ function showDbh(tree) {
   const input = byId("review-dbh"), dbh = (tree && annotationOf(tree)?.dbh_cm) ?? null;
   input.value = dbh === null ? "" : String(dbh);
   input.setAttribute("aria-invalid", "false");
+  input.dataset.asked = "";
   setText(byId("review-dbh-error"), "");
 }
 
@@ -189,7 +209,7 @@ export function fillCard() {
     requestAnimationFrame(() => { draft.shownAt = performance.now(); });
   }
   setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
-  setText(byId("review-state"), review === "rejected" ? `rejected: ${annotationOf(tree).kind}` : review);
+  setText(byId("review-state"), `${review === "rejected" ? `rejected: ${annotationOf(tree).kind}` : review}${["open", "skipped"].includes(review) ? "" : byOther(annotationOf(tree))}`);
   byId("review-state").dataset.state = review;
   for (const id of ["review", "review-more"]) byId(id).classList.toggle("loading", old);
   byId("review").setAttribute("aria-busy", String(old));

@@ -5,6 +5,7 @@ import { button, byId, el, setText } from "../core/dom.js";
 import { fileName } from "../core/download.js";
 import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
+import { distance } from "../core/nearest.js";
 import { showNews } from "../core/problem.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
@@ -14,13 +15,13 @@ import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answeredTrees, answerText, byClick, callMe, change, choose, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText } from "./annotations.js";
+import { annotating, annotationOf, answerBeside, answeredTrees, answerText, byClick, byOther, callMe, change, choose, contradicting, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText, withoutTree } from "./annotations.js";
 import { card, fillCard, moreEvidence, startCard, typeDbh } from "./card.js";
 import { startSection } from "./section.js";
 
 const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
 const EVERY = 300; // [ms] between two updates while a run plays
-const SHOWN_ANSWERS = 5;
+const SHOWN_ANSWERS = 5, MOST_LISTED = 12;
 const LARGEST_TABLE = 900_000; // [bytes]
 const lines = new Map(); // rows of the table by the id of the annotation
 const { undo, redo, canUndo, canRedo } = reviewHistory;
@@ -32,10 +33,11 @@ function build() {
   kind.title = "Answered at once with Shift: P pole, H person, B bush, O other";
   const unit = el("select", { id: "annotate-unit", "aria-label": "Unit of a DBH column whose header names none" },
     ...[["", "unit of DBH in the file"], ["cm", "cm"], ["m", "m"], ["mm", "mm"]].map(([value, text]) => el("option", { value, text })));
+  const replaces = el("input", { id: "annotate-replaces", type: "checkbox" });
   const file = el("input", { id: "annotate-file", type: "file", accept: ".csv,.txt,text/csv", hidden: true, "aria-label": "Table of trees", onchange: async () => {
     const [chosen] = file.files;
     file.value = "";
-    if (chosen) await take(chosen, unit.value);
+    if (chosen) await take(chosen, unit.value, replaces.checked);
   } });
   const asked = el("div", { id: "annotate-ask", class: "annotate-ask", hidden: Boolean(givenName()) }, el("label", {}, "Your name, stored with each answer ", nameField("annotate-asked")),
     button("annotate-nameless", "Not now", "Answers are stored under the name of this browser", () => { asked.hidden = true; }, "quiet small"));
@@ -60,13 +62,17 @@ function build() {
     el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
       el("label", { title: "The ground truth of this run is never changed: an annotation that contradicts it is kept next to it" }, "Score against ",
         el("select", { id: "annotate-against", onchange: (event) => scoreAgainst(event.target.value) }, ...Object.entries(AGAINST).map(([value, text]) => el("option", { value, text })))),
-      el("p", { id: "annotate-warned", class: "note warned", role: "status" })),
+      el("p", { id: "annotate-warned", class: "note warned", role: "status" }),
+      el("div", { id: "annotate-contradicting", class: "review-history", role: "group", "aria-label": "Annotations that contradict the ground truth" })),
+    el("div", { id: "annotate-without", hidden: true }, el("p", { class: "note" }),
+      el("div", { class: "review-history", role: "group", "aria-label": "Answers without a tree in this map" })),
     el("div", { class: "annotate-list" },
       el("table", { id: "annotations", class: "plain" }, el("thead", {}, el("tr", {},
         ...[["tree"], ["class"], ["DBH cm"], ["x ", unitNode()], ["y ", unitNode()], ["by"]].map((parts) => el("th", { scope: "col" }, ...parts)), el("td"))), el("tbody"))),
     el("div", { class: "annotate-files" },
       el("label", {}, "Name ", nameField("annotate-name")),
-      button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,
+      button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised. The rows are stored under your name", () => file.click()), unit,
+      el("label", { title: "For a table that was saved here and corrected elsewhere: its class and DBH replace those of the annotation at the same place. Otherwise rows that differ are left out and named" }, replaces, " replace what differs"), file,
       truthLink("csv", "CSV"), truthLink("geojson", "GeoJSON")),
     ...ofExtensions("annotateSections"));
 }
@@ -94,15 +100,15 @@ function truthLink(suffix, format) {
   } });
 }
 
-async function take(file, unit) {
+async function take(file, unit, replaces) {
   if (file.size > LARGEST_TABLE) {
     draft.error = `${file.name} is larger than ${LARGEST_TABLE / 1e6} MB.`;
     return fill();
   }
   const confirmed = () => trees().filter((tree) => reviewOf(tree) === "confirmed").length, before = confirmed();
-  const done = await importTable(await file.text(), unit);
+  const done = await importTable(await file.text(), unit, replaces);
   const more = confirmed() - before;
-  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
+  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
   if (done) showNews(imported);
   fill();
 }
@@ -185,6 +191,11 @@ function fill() {
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), contradictionText());
+  fillRows(byId("annotate-contradicting"), contradicting());
+  const without = withoutTree(), [said, list] = byId("annotate-without").children;
+  byId("annotate-without").hidden = !without.length;
+  setText(said, `${count(without.length, "answer")} ${without.length === 1 ? "belongs" : "belong"} to no tree of this map, so ${without.length === 1 ? "it decides" : "they decide"} nothing:`);
+  fillRows(list, without);
   fillTable();
 }
 
@@ -199,6 +210,18 @@ function fillHistory() {
     ...shown.map((tree) => el("button", { class: "quiet small", type: "button", "aria-pressed": String(tree.number === state.selected), text: `${tree.number} ${classOf(tree)}`, title: `Show tree ${tree.number} again`, onclick: () => lookAt(tree) })));
 }
 
+// Buttons that choose annotations, the first ones of many.
+function fillRows(box, annotations) {
+  const shown = annotations.slice(0, MOST_LISTED), now = JSON.stringify([shown.map((row) => [row.id, row.kind, treeNumberOf(row)]), draft.chosen]);
+  box.hidden = !shown.length;
+  if (box.dataset.now === now) return; // the focus stays on a button
+  box.dataset.now = now;
+  box.replaceChildren(...shown.map((row) => {
+    const number = treeNumberOf(row), place = placeTexts([row.x, row.y]).join(", ");
+    return el("button", { class: "quiet small", type: "button", "aria-pressed": String(row.id === draft.chosen), text: `${number === null ? `at ${place}` : number} ${row.kind}`, title: `Select it: ${row.kind} by ${row.who} at ${place}`, onclick: () => { choose(row.id); showCard(); } });
+  }));
+}
+
 const classOf = (tree) => annotationOf(tree)?.kind ?? "…"; // its answer is on its way
 
 function hint(tree) {
@@ -206,10 +229,16 @@ function hint(tree) {
   const chosen = rowOf(draft.chosen);
   if (chosen && treeNumberOf(chosen) === null) return `Your annotation (${chosen.kind}) belongs to no found tree: Y, N and the keys of the classes set its class, arrows move it, Del deletes it.`;
   if (imported) return imported;
-  if (tree) return `Tree ${tree.number}, ${seenText(tree)}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?`;
+  if (tree) return `Tree ${tree.number}, ${seenText(tree)}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?${besideHint(tree)}`;
   if (trees().length && !unreviewed().length) return `${trees().length === 1 ? "The tree is" : `All ${trees().length} trees are`} reviewed. ${truthText()}`;
   if (!rows().length) return "Press Next to review the trees one by one, or Add and click on the map where a tree was missed (Shift+click in the 3D scene).";
   return truthText();
+}
+
+// Another thing was there when an answer was given beside this tree.
+function besideHint(tree) {
+  const row = answerBeside(tree);
+  return row ? ` The answer “${row.kind}”${byOther(row)}, ${fixed(distance(row, tree), 2)} m beside it, was given for another thing.` : "";
 }
 
 function fillTable() {

@@ -16,7 +16,7 @@ import { closeOver, openOver } from "../scene/overlay.js";
 import { pressInScene } from "../scene/scene.js";
 import { openSearch } from "../tune/panel.js";
 import { redo, reset, undo } from "../tune/parameters.js";
-import { exchange, showTabs, toggleMap, toggleTabs, useLayout } from "./layout.js";
+import { exchange, showTabs, toggleMap, toggleScene, toggleTabs, useLayout } from "./layout.js";
 import { showShareAtEnd } from "./share.js";
 import { openTab } from "./tabs.js";
 
@@ -94,7 +94,7 @@ export const ACTIONS = [
     [`Repair: ${text}`, "", "", edits(() => { toTab("repair")(); useTool(kind); }), null, "mend correct fix edit map"]),
   ["Clear the selection; close the overlay of the scene", "esc", "Escape", leave],
   ["Layout: exchange map and scene", "x", "x", exchange, "exchange map and scene"],
-  ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],
+  ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the 3D scene", "", "", toggleScene], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],
   ...["Monitor", "Tune", "Annotate", "Results"].map((name) => [`Layout: ${name}`, `shift ${name[0]}`, name[0], () => useLayout(name), `the layout ${name}`, "standard sizes places arrange"]),
   ["Settings: theme, large controls, sound and vibration", "", "", showSheet, null, "options preferences gloves touch tablet contrast sunlight alarm warning mute"],
   ["Settings and keyboard shortcuts", "?", "?", showSheet, null, "help keys hotkeys manual"],

@@ -7,7 +7,7 @@ import { openTab, visible } from "./tabs.js";
 
 // left: width of the left part, top: height of the upper right part; lower: height of the lower left part while the tab Tune has the
 // right one for its sliders, all in percent; exchanged: the scene is on the left.
-const STANDARD = { left: 62, top: 55, lower: 40, exchanged: true, map: true, tabs: true };
+const STANDARD = { left: 62, top: 55, lower: 40, exchanged: true, map: true, tabs: true, scene: true };
 const LARGE_MAP = { left: 45, exchanged: false };
 const BUILT_IN = {
   Monitor: STANDARD,
@@ -41,18 +41,21 @@ function setLayout(changes) {
   layout.left = clipped(layout.left);
   layout.top = clipped(layout.top);
   layout.lower = clipped(layout.lower);
+  layout.scene ||= !(layout.map || layout.tabs);
   remember("layout", JSON.stringify(layout));
   show();
 }
 
-const isTuning = () => visible("tune") && layout.map && layout.tabs;
+const isTuning = () => visible("tune") && layout.map && layout.tabs && layout.scene;
 // The height that the horizontal splitter changes now.
 const height = () => (isTuning() ? "lower" : "top");
 
 export const exchange = () => setLayout({ ...(layout.exchanged ? LARGE_MAP : { left: STANDARD.left, exchanged: true }), map: true });
 export const toggleMap = () => setLayout({ map: !layout.map });
+export const toggleScene = () => setLayout({ scene: !layout.scene });
 export const toggleTabs = () => setLayout({ tabs: !layout.tabs });
 export const showTabs = () => layout.tabs || toggleTabs();
+const showScene = () => layout.scene || toggleScene();
 export function useLayout(name) {
   setLayout(all()[name]);
   if (name in TABS) openTab(TABS[name]);
@@ -63,13 +66,15 @@ function show() {
   work.style.setProperty("--left", `${layout.left}%`);
   work.style.setProperty("--top", `${layout.top}%`);
   work.style.setProperty("--lower", `${layout.lower}%`);
-  work.classList.toggle("exchanged", layout.exchanged && layout.map);
+  work.classList.toggle("exchanged", layout.exchanged && layout.map && layout.scene);
   work.classList.toggle("no-map", !layout.map);
+  work.classList.toggle("no-scene", !layout.scene);
   work.classList.toggle("no-tabs", !layout.tabs);
   work.classList.toggle("tuning", isTuning()); // the map below the scene, the sliders beside both
   for (const [id, value] of [["split-left", layout.left], ["split-top", layout[height()]]]) byId(id).setAttribute("aria-valuenow", String(Math.round(value)));
   byId("map-exchange").setAttribute("aria-pressed", String(layout.exchanged));
   byId("layout-map").checked = layout.map;
+  byId("layout-scene").checked = layout.scene;
   byId("layout-tabs").checked = layout.tabs;
   fillNames();
   dispatchEvent(new Event("resize")); // of the plots
@@ -123,6 +128,7 @@ function startSplitter(id, side, keys, percentAt) {
 function menu() {
   return [
     el("label", {}, el("input", { id: "layout-map", type: "checkbox", onchange: toggleMap }), " 2D map"),
+    el("label", {}, el("input", { id: "layout-scene", type: "checkbox", onchange: toggleScene }), " 3D scene"),
     el("label", {}, el("input", { id: "layout-tabs", type: "checkbox", onchange: toggleTabs }), " Tabs and table"),
     el("button", { class: "small", text: "Exchange map and scene", onclick: exchange }),
     el("div", { class: "row" }, el("select", { id: "layout-names", "aria-label": "Saved layouts", onchange: (event) => event.target.value && useLayout(event.target.value) }),
@@ -139,6 +145,7 @@ export function startLayout() {
   startSplitter("split-left", () => "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
   startSplitter("split-top", height, { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (isTuning() ? box.bottom - event.clientY : event.clientY - box.top)) / box.height);
   on("tab", show);
+  on("over", () => { if (document.querySelector(".scene.covered")) showScene(); }); // stages, comparison and camera lie over it
   saved = Object.fromEntries(Object.entries(stored("layouts")).map(([name, one]) => [name, completed(one)]));
   setLayout(stored("layout"));
 }

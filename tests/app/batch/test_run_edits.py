@@ -7,9 +7,11 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from app.batch.export import read_for_export, trees_geojson
-from app.batch.run_edits import SAME_THING, measured_by_people, reviewed_run, reviews_of
+from app.batch.run_edits import SAME_THING, measured_by_people, reach_at, reviewed_run, reviews_of
 from app.batch.run_folder import read_run, read_terrain
 from app.store.records import FRAME, SKIPPED, Author, Content
 from app.store.store import Store
@@ -36,6 +38,24 @@ PLACES = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
 def test_the_nearest_annotation_decides(contents, reviews):
     assert reviews_of([1, 2, 3], PLACES, contents) == reviews
     assert reviews_of([], np.zeros((0, 2)), contents) == {}
+
+
+@given(st.floats(0.0, 1.2), st.floats(0.0, 0.4), st.sampled_from(["tree", "pole"]), st.floats(-np.pi, np.pi))
+def test_an_answer_never_passes_to_a_tree_that_was_a_neighbour(
+    gap: float, off: float, kind: str, angle: float
+):
+    own = np.array([5.0, -3.0])
+    beside = own + gap * np.array([np.cos(angle), np.sin(angle)])
+    place = own - off * np.array([np.cos(angle), np.sin(angle)])  # on the far side of the neighbour
+    both = np.array([own, beside, [90.0, 0.0]])
+    x, y = place.tolist()
+    answer = Content(x, y, kind, reach=reach_at(both, (x, y)))
+    if gap > 1e-6:
+        assert list(reviews_of([1, 2, 3], both, [answer])) == [1]
+    assert reviews_of([2, 3], both[1:], [answer]) == {}  # the own tree is gone
+    # An isolated tree that moves is the same one.
+    assert reach_at(both[:1], (x, y)) is None
+    assert reach_at(np.zeros((0, 2)), (0.0, 0.0)) is None
 
 
 def test_the_nearest_tape_counts_and_what_belongs_to_no_tree_is_added():

@@ -397,10 +397,10 @@ async def test_what_agrees_leaves_the_truth_of_the_source_exact_and_a_person_cho
         await edit(client, "POST", x=2.2, y=0.1)  # the tree that was found there is one
         assert dashboard.truth is not None
         assert sorted(dashboard.truth.x.tolist()) == sorted(exact.x.tolist())
-        assert dashboard.annotation_editor.as_plain()["contradicting"] == 0
-        await edit(client, "POST", x=0.1, y=0.0, kind="pole")
+        assert dashboard.annotation_editor.as_plain()["contradicting"] == []
+        wrong = (await edit(client, "POST", x=0.1, y=0.0, kind="pole")).json()["id"]
         await edit(client, "POST", x=30.0, y=0.0, kind="pole")  # nobody knew of it
-        assert (await client.get("/api/annotations")).json()["contradicting"] == 1
+        assert (await client.get("/api/annotations")).json()["contradicting"] == [wrong]
         await edit(client, "POST", "/undo")
         told = await choose("own")
         assert (told["used"], told["own"]) == ("source", len(exact.x))

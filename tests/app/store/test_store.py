@@ -317,6 +317,24 @@ def test_what_cannot_be_used_is_said_in_one_line_and_kept(tmp_path: Path, damage
     assert path.read_bytes() == before
 
 
+def test_annotations_of_the_version_before_are_kept(tmp_path: Path):
+    with contextlib.closing(Store(tmp_path)) as store:
+        run = store.open_run("d", "u", "n")
+        store.add(run, ANN, [Content(1.0, 2.0, "pole")])
+    path = tmp_path / FILE_NAME
+    spoil(path, "ALTER TABLE annotations DROP COLUMN reach")
+    spoil(path, "PRAGMA user_version = 8")
+    for _ in range(2):
+        with contextlib.closing(Store(tmp_path)) as store:
+            assert store.contents("d") == [Content(1.0, 2.0, "pole")]
+    with contextlib.closing(Store(tmp_path)) as store:
+        (row,) = store.annotations(run)
+        store.change(run, ANN, row.id, row.version, replace(row.content, reach=0.2))
+        assert store.contents("d") == [Content(1.0, 2.0, "pole", reach=0.2)]
+        store.undo(run, ANN)
+        assert store.contents("d") == [Content(1.0, 2.0, "pole")]
+
+
 def test_a_database_of_another_program_stays_as_it_is(tmp_path: Path):
     path = tmp_path / FILE_NAME
     with contextlib.closing(sqlite3.connect(path)) as connection, connection:
