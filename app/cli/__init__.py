@@ -16,6 +16,8 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
 from types import FrameType, ModuleType
 from typing import NoReturn
 
@@ -70,8 +72,22 @@ class _Parser(argparse.ArgumentParser):
         self.exit(WRONG_USAGE, f"{self.prog}: {message}. Help: {self.prog} --help\n")
 
 
+def _keep_bytecode() -> None:
+    """Keep the bytecode of this process and its children in the cache folder of the user if Python must not
+    write it beside the sources and the libraries came without it: each start would compile 1,300 modules."""
+    library = find_spec("numpy")
+    if not sys.dont_write_bytecode or sys.pycache_prefix or library is None or library.cached is None:
+        return
+    if not Path(library.cached).exists():
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(cache / "stemmap" / "bytecode")
+        sys.dont_write_bytecode = False
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+
 def command() -> NoReturn:
     """The program `stemmap`: runs `main` and ends the process with its exit code. It never returns."""
+    _keep_bytecode()
     code = main()
     if "zenoh" in sys.modules:
         # Threads of zenoh may abort the process while the interpreter shuts down, after all files are written

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import py_compile
 import re
 import shutil
 import signal
@@ -636,6 +637,28 @@ def test_the_program_ends_with_the_code_and_all_it_said(tmp_path, library):
     told = subprocess.run(words, capture_output=True, text=True, check=False)
     assert (told.returncode, told.stderr) == (0, "")
     assert told.stdout.startswith("stemmap")
+
+
+@pytest.mark.parametrize("has_bytecode", [False, True], ids=["uv", "pip"])
+def test_bytecode_is_kept_where_python_may_write_none_and_the_libraries_came_without(tmp_path, has_bytecode):
+    module = tmp_path / "libraries" / "numpy" / "__init__.py"
+    module.parent.mkdir(parents=True)
+    module.touch()
+    if has_bytecode:
+        bytecode = module.parent / "__pycache__" / f"__init__.{sys.implementation.cache_tag}.pyc"
+        py_compile.compile(str(module), cfile=str(bytecode))
+    shown = "import os, sys; from app import cli; cli._keep_bytecode(); "
+    shown += "print(sys.dont_write_bytecode, sys.pycache_prefix, os.environ.get('PYTHONPYCACHEPREFIX'))"
+    settings = {name: value for name, value in os.environ.items() if name != "PYTHONPYCACHEPREFIX"} | {
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "XDG_CACHE_HOME": str(tmp_path),
+        "PYTHONPATH": str(module.parents[1]),
+    }
+    told = subprocess.run(
+        [sys.executable, "-c", shown], env=settings, capture_output=True, text=True, check=True
+    ).stdout.split()
+    kept = str(tmp_path / "stemmap" / "bytecode")
+    assert told == (["True", "None", "None"] if has_bytecode else ["False", kept, kept])
 
 
 @pytest.mark.parametrize(("warning", "code"), [(f"{LOST} since 1.2 s: no scan fits", 3), ("of no harm", 0)])

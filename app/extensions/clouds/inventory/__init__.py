@@ -460,7 +460,9 @@ def _sides(place: Float) -> tuple[float, float]:
 
     if not len(place):
         return 0.0, 0.0
-    line = shapely.linestrings(np.concatenate([place, place[:1]]))  # one object in place of one for each point
+    line = shapely.linestrings(
+        np.concatenate([place, place[:1]])
+    )  # one object in place of one for each point
     corners = shapely.get_coordinates(shapely.oriented_envelope(line))
     sides = np.hypot(*np.diff(corners, axis=0).T)[:2].tolist()  # fewer for points on a line
     narrow, long = sorted([0.0, 0.0, *sides])[-2:]
