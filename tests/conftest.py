@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -19,18 +20,15 @@ _WORKERS = 2
 # Folder and files that take longest, in this order (uv run pytest --durations=0 lists the times).
 _LONGEST = (
     "browser",
+    "app/extensions/maps/localisation/test_localiser.py",
+    "app/extensions/clouds/test_cloud_run.py",
+    "app/extensions/clouds/test_cloud_frame.py",
+    "app/extensions/stand/test_georeference_routes.py",
+    "app/extensions/clouds/test_map_plot.py",
     "app/worker/test_remap.py",
-    "app/web/test_serve.py",
-    "pipeline/test_jit.py",
+    "app/extensions/maps/test_localise.py",
     "app/worker/test_supervisor.py",
-    "app/cli/test_continue.py",
-    "app/extensions/search/test_search.py",
-    "pipeline/detection/test_people.py",
-    "app/cli/test_merge.py",
-    "pipeline/slam/test_troubles.py",
-    "pipeline/loop_closure/test_stem_matching.py",
-    "app/worker/test_session.py",
-    "app/robot/test_live_rerun.py",
+    "app/extensions/cluster/test_dask.py",
 )
 
 # No deadline, because a kernel compiles at its first call. The default profile draws the same few examples at
@@ -86,8 +84,16 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> _Scheduler:
     return _Scheduler(config, log)
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest selects by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put what takes longest first, so that the test processes end together."""
+    """Mark the further variants of `slow_after` as slow, and put what takes longest first, so that the test
+    processes end together."""
+    variants: Counter[str] = Counter()
+    for item in items:
+        if marker := item.get_closest_marker("slow_after"):
+            variants[item.nodeid.split("[")[0]] += 1
+            if variants[item.nodeid.split("[")[0]] > marker.args[0]:
+                item.add_marker(pytest.mark.slow)
     order = {name: k for k, name in enumerate(_LONGEST)}
 
     def rank(item: pytest.Item) -> int:

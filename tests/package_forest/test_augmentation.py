@@ -48,6 +48,7 @@ def park(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_copies_hold_trees_and_poles_and_are_the_same_each_time(park):
     made = [list(pasted_examples(park, copy, preset("forest"), 25.0)) for copy in (0, 1, 2, 0)]
     label = np.concatenate([e.label for copy in made for e in copy])
@@ -96,6 +97,7 @@ def test_what_is_farther_is_hidden():
     assert len(points) == len(wall)
 
 
+@pytest.mark.slow
 def test_copies_are_drawn_by_what_the_scans_hold_whatever_their_folder_is_called(park, tmp_path):
     other = tmp_path / "elsewhere" / park.name
     shutil.copytree(park, other)

@@ -83,6 +83,7 @@ def test_what_is_switched_off_is_named(words: str, name: str, monkeypatch: pytes
     assert f"The extension {name} is switched off by {VARIABLE}." in capsys.readouterr().err
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("off", ["all", *NAMES])
 async def test_the_core_needs_no_extension(off: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     """A run is opened, played, tuned, annotated and exported, with a real worker process."""

@@ -57,6 +57,7 @@ def usual(stand: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     return trees(map_files(Played(SetClock(stand, 0)), tmp_path_factory.mktemp("usual") / "out"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step_s", [3600, -3600, None], ids=["+1 h", "-1 h", "1970"])
 def test_a_clock_that_is_set_changes_no_map(stand: Path, usual: Any, tmp_path: Path, step_s: int | None):
     found = trees(map_files(Played(SetClock(stand, step_s)), tmp_path / "out"))

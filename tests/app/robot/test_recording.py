@@ -176,6 +176,7 @@ def count_messages(path: Path) -> dict[str, int]:
         return {channel.topic: channel.count for channel in container.channels}
 
 
+@pytest.mark.slow
 def test_a_mapper_five_times_slower_than_the_robot_loses_nothing_in_the_recording(
     stand: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):

@@ -23,6 +23,7 @@ SCANS = 40
 PARKS = [f"park_trunks/{name}" for name in ("00", "03", "04", "08")]
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("uri", [*PARKS, "sim:wild?seed=3"])
 async def test_the_base_of_each_drawn_stem_is_within_its_own_points_or_on_the_terrain(
     uri: str, scene: Scene, shared_data: Path

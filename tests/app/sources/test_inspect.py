@@ -212,6 +212,7 @@ def test_a_run_that_failed_is_opened_again_with_the_same_choice():
     session.close()
 
 
+@pytest.mark.slow
 async def test_a_whole_cloud_is_checked_without_a_drive_through_it(tmp_path: Path) -> None:
     """A cube full of points has no path for a robot, but it is a cloud."""
     points = np.random.default_rng(3).uniform(0.0, 2.0, (5_000, 3))

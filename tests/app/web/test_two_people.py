@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 import httpx
+import pytest
 from websockets.asyncio.client import ClientConnection, connect
 
 from app.dashboard.dashboard import Dashboard
@@ -130,6 +131,7 @@ async def test_of_two_edits_of_a_tree_at_once_one_is_taken_and_the_other_is_told
         assert sum(steps) == 1 + len(taken)
 
 
+@pytest.mark.slow
 async def test_a_viewer_who_floods_loses_no_edit_of_the_owner_and_changes_nothing() -> None:
     async with (
         shared() as (host, dashboard, client),

@@ -46,6 +46,7 @@ def test_each_scan_has_the_path_of_its_time(moves: list[tuple[bool, int]]) -> No
             assert [xs_of(store, k) for k in range(len(known))] == known
 
 
+@pytest.mark.slow
 def test_corrections_of_a_long_path_take_no_memory() -> None:
     with closing(FrameStore(1 << 30)) as store:
         xs = np.zeros(20_000).tolist()

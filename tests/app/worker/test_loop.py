@@ -422,6 +422,7 @@ def test_a_huge_scan_is_thinned_evenly_in_the_picture_and_only_there() -> None:
     assert picture_of(frame(0, 0)).counts == frame(0, 0).counts
 
 
+@pytest.mark.slow
 def test_a_picture_that_cannot_be_sent_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("app.worker.protocol.LARGEST_MESSAGE", 100_000)
     stream = io.BytesIO()

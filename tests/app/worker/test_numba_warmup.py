@@ -85,6 +85,7 @@ print(*sorted(late), sep="\\n", end="")
 """
 
 
+@pytest.mark.slow
 def test_the_halves_compile_what_drives_with_troubles_and_a_slider_call():
     run = [sys.executable, "-c", PROGRAM]
     told = subprocess.run(run, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)

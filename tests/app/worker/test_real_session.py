@@ -196,6 +196,7 @@ def test_with_other_parameters_in_force_nothing_of_before_is_shown(session: Sess
     assert not session.shown.is_stored
 
 
+@pytest.mark.slow
 def test_the_page_and_the_command_line_give_the_same_files(session: Session, tmp_path: FilePath) -> None:
     out, there = tmp_path / "out", tmp_path / "page"
     assert main(["map", URI, "--out", str(out), "--seed", "3"]) == 0

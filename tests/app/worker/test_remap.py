@@ -319,6 +319,7 @@ def test_a_change_from_here_on_leaves_the_map_before_it(session):
     assert session.status().remapped is None
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("parameters", [FEWER, LATER])
 @pytest.mark.parametrize("done", [3, 18])
 def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done, parameters):

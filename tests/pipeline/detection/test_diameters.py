@@ -149,6 +149,7 @@ def seen_from(rng, radius, lean, distance):
     return np.stack([reach * np.cos(a[met]), reach * np.sin(a[met]), h[met]], axis=1)
 
 
+@pytest.mark.slow
 def test_the_sigma_of_a_diameter_is_what_it_errs():
     """NEES with one degree of freedom: 1 where sigmas are honest, over trunks of 8 to 60 cm that are seen at
     2 to 9 m; its mean over 60 trunks lies within 0.63 and 1.37 in 95 of 100 cases, if errors were normal."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
@@ -43,6 +44,7 @@ def test_two_long_pairs_are_better_than_a_short_one():
     assert match(0.01 * found, 0.01 * truth, 0.03).tolist() == [1, 0]
 
 
+@pytest.mark.slow
 def test_many_trees_need_no_matrix_of_all_pairs():
     """40,000 squared distances would be 13 GB."""
     rng = np.random.default_rng(1)

@@ -19,6 +19,7 @@ def mutations(original: bytes, seed: int) -> Iterator[bytes]:
     return (mutation(original, seed, number) for number in range(MUTATIONS))
 
 
+@pytest.mark.slow_after(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_files_end_with_a_clear_error_or_with_losses(kind: str, shared_data: Path, tmp_path: Path):
     name, read = KINDS[kind]

@@ -60,6 +60,7 @@ def test_behind_a_step_the_times_go_on_in_the_clock_of_the_sensor(tmp_path: Path
     assert stamps == [begun_ns + k * STEP_NS for k in range(SCANS)]
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 def test_topics_that_were_written_one_after_the_other_are_no_step(kind: str, tmp_path: Path, opened: Opened):
     def fill(author: Author, write: Write) -> None:
@@ -139,6 +140,7 @@ def check_order(source: Source, *, gap_ns: int = 0) -> None:
         assert (np.diff(stamps) > 0).all()
 
 
+@pytest.mark.slow_after(12)
 @pytest.mark.parametrize("which", ["/points", "/odom", "stamps", "all"])
 @pytest.mark.parametrize("step_s", STEPS_S)
 def test_any_step_of_any_clock_keeps_the_order_of_the_file(
@@ -175,6 +177,7 @@ def test_two_lidars_on_one_topic_with_other_delays_are_no_steps(tmp_path: Path, 
     assert not source.losses
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("begun_s", [12.3, 946_684_800.0, START_NS * 1e-9 + 37.0, START_NS * 1e-9 - 3.0])
 @pytest.mark.parametrize("other", ["/points", "/odom"])
 def test_a_topic_by_another_clock_is_aligned_without_its_delay(

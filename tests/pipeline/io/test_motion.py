@@ -71,6 +71,7 @@ def test_wheels_say_where_the_search_begins():
     assert "started from the wheel odometry" in words
 
 
+@pytest.mark.slow
 def test_reading_again_gives_the_same_poses():
     moving, _ = with_odometry(without_wheels(), "lidar")
     poses = {}
@@ -91,6 +92,7 @@ def test_reading_again_gives_the_same_poses():
     assert len({**poses, **again}) > 20
 
 
+@pytest.mark.slow
 def test_the_map_without_wheels_is_close_to_the_map_with_them(tmp_path: Path):
     def mapped(source: Source, name: str) -> dict[str, object]:
         parameters = preset("forest")

@@ -213,6 +213,7 @@ def drive_of_pcds(folder: Path, *, in_world: bool, views: bool) -> list[Pose3]:
     return poses
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("in_world", [False, True])
 @pytest.mark.parametrize("views", [False, True])
 def test_the_poses_in_the_headers_move_the_scans(in_world: bool, views: bool, tmp_path: Path, opened: Opened):

@@ -251,6 +251,7 @@ def unlinked(yaw: float, *, standing: bool = False) -> Callable[[Author, Write],
     return fill
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("degrees", [0, 90, 180, 270, 33])
 def test_the_yaw_of_a_mounting_is_found_by_its_motion(degrees: int, tmp_path: Path, opened: Opened):
     source = opened(write_recording("mcap", tmp_path, unlinked(math.radians(degrees))))
@@ -260,6 +261,7 @@ def test_the_yaw_of_a_mounting_is_found_by_its_motion(degrees: int, tmp_path: Pa
     assert not source.losses
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(("degrees", "stated"), [(90, 0), (60, -60), (90, 90), (33, 30)])
 def test_a_fixed_transform_with_another_yaw_than_the_motion_is_told(
     degrees: int, stated: int, tmp_path: Path, opened: Opened
@@ -287,6 +289,7 @@ def test_a_mounting_of_the_user_with_another_yaw_than_the_motion_is_told(tmp_pat
     assert text.endswith("and not 0; correct it")
 
 
+@pytest.mark.slow
 def test_odometry_of_a_robot_that_stands_contradicts_scans_that_move(tmp_path: Path, opened: Opened):
     source = opened(write_recording("mcap", tmp_path, unlinked(0.0, standing=True)))
     assert any("that contradict the odometry" in reason for reason in source.losses)

@@ -280,6 +280,7 @@ def test_numbers_stay_with_their_trees_over_the_loop():
     assert np.count_nonzero(near < 1.0) - len(confirmed) <= 4, "at most two trees stand twice"
 
 
+@pytest.mark.slow
 def test_a_snapshot_taken_before_the_loop_goes_on_to_the_same_bytes():
     run = ring(0)
     at = run.closed()[0]

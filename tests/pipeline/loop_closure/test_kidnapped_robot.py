@@ -88,6 +88,7 @@ def mapped():
     return mapped_before()[2], [m.process(step) for step in kidnapped()[1]]
 
 
+@pytest.mark.slow
 def test_a_drive_without_a_jump_is_never_lost():
     assert {frame.health.state for frame in mapped()[0]} <= {"good", "weak"}
 

@@ -190,6 +190,7 @@ def test_voxels_are_halved_while_three_beams_hit_each(ring_step: float, azimuth_
     assert voxel_sides(None) == [VOXEL]
 
 
+@pytest.mark.slow
 def test_a_sensor_that_sees_a_part_of_the_stand_turns_with_the_robot():
     """In voxels of 1 m alone, the turn is 4.4 degrees too small after 12 s."""
     source = open_source("sim:stand?duration=12&seed=3&lidar=solid")

@@ -74,6 +74,7 @@ def often_smoothed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FastSlam, "is_smoothing_due", FastSlam.is_keyframe)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("changes", CHANGES)
 def test_each_scan_and_each_state_are_those_of_the_main_loop(changes, often_smoothed):
     known, wanted = MappedRun(FOREST), FOREST.replace(changes)

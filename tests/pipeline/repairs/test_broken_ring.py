@@ -98,6 +98,7 @@ def repaired(seed: int) -> Person:
     return person
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_ten_repairs_mend_a_broken_ring(seed):
     of, truth = run(seed)
@@ -128,6 +129,7 @@ def test_the_quality_of_the_pose_is_said_to_be_of_the_map_before_the_tie():
     assert good == Health(reason="before the repairs")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_repairs_hold_after_the_run_was_mapped_again(seed):
     again, truth = run(seed, slam__particles=30)
@@ -141,6 +143,7 @@ def test_the_repairs_hold_after_the_run_was_mapped_again(seed):
     assert np.mean(error < 0.5) > 0.9
 
 
+@pytest.mark.slow
 def test_each_undone_repair_gives_the_map_before_it():
     person = repaired(0)
     of, done = person.run, person.repairs
@@ -221,6 +224,7 @@ def test_repairs_without_their_trees_or_places_say_so():
     assert len(found.frame.trees.number) == len(of.frame.trees.number)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_stems_around_a_tie_tell_a_wrong_one(seed):
     of, truth = run(seed)

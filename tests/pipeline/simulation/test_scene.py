@@ -16,6 +16,7 @@ from pipeline.types.records import HIDDEN
 PLAIN = [name for name in SCENARIOS if name != WILD]
 
 
+@pytest.mark.slow_after(3)
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_each_scenario_opens_and_its_path_keeps_clear(name):
     for seed in range(3):
@@ -88,6 +89,7 @@ def test_the_papers_plot_has_its_things_within_its_box():
     assert np.abs(path.y).max() < 1.0
 
 
+@pytest.mark.slow
 def test_one_may_ask_for_more_trees_until_the_plot_is_full():
     trees = open_simulated("sim:stand?trees=90").truth().trees
     assert trees is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -255,6 +256,7 @@ def test_normalised_errors_of_simulated_runs_are_consistent():
     assert 0.7 < np.mean(errors.innovations) < 1.3
 
 
+@pytest.mark.slow
 def test_a_straight_drive_past_few_trees_stays_consistent_without_loops():
     errors = Errors()
     for seed in range(200, 205):

@@ -80,6 +80,7 @@ def drive(seed, strides, trees=None, *, poses=True, heading=True, bias=0.0, blin
     return np.array(rows), slam
 
 
+@pytest.mark.slow
 def test_repeated_poses_of_one_source_are_consistent():
     """Sixteen runs: three sigma of the mean of chi-square; with independent errors the value was 45."""
     nees = np.mean([drive(seed, AWAY)[0][STEPS // 2 :, 0] for seed in range(16)], axis=0)
@@ -93,6 +94,7 @@ def test_the_drift_is_bounded_by_the_error_of_the_source():
     assert told < 2.0
 
 
+@pytest.mark.slow
 def test_poses_do_not_degrade_a_pose_among_better_known_trees():
     """With independent errors the value was 7.5, and the error 0.14 m instead of 0.10 m."""
     rows = []
@@ -104,6 +106,7 @@ def test_poses_do_not_degrade_a_pose_among_better_known_trees():
     assert np.sqrt(np.square(error).mean()) < 0.12
 
 
+@pytest.mark.slow
 def test_a_long_drift_of_the_heading_stays_consistent():
     """600 m on a circle: when the covariance followed only the odometry, it turned away from the path, and
     the value was 26 instead of 3.5."""

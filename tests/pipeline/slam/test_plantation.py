@@ -46,6 +46,7 @@ def mapped(place: Place, trouble: Trouble, seed: int) -> tuple[Float, list[str],
     return error, [w for frame in frames for w in frame.warnings], false
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("jitter", [0.0, 0.15])
 @pytest.mark.parametrize(("stride", "pitch"), [(0.1, 2.0), (0.3, 3.0), (0.3, 4.0)])
 def test_rows_of_trees_do_not_contradict_a_correct_odometry(

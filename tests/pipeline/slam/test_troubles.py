@@ -122,6 +122,7 @@ def assert_survived(name: str, day: Day, *, enough: bool = True) -> None:
     assert day.drive.false_trees(trees, before + (0.0 if lost else error)) <= 1
 
 
+@pytest.mark.slow_after(8)
 @pytest.mark.parametrize("name", TROUBLES)
 @pytest.mark.parametrize(("place", "seed"), first_of([("stand", 1), ("a circle", 2)]))
 def test_a_bad_day(name: str, place: str, seed: int) -> None:

@@ -52,6 +52,7 @@ def test_a_loop_ends_where_it_began(source):
     assert source.description.warnings == ()
 
 
+@pytest.mark.slow
 def test_a_loop_that_is_cut_short_says_so(files, monkeypatch):
     monkeypatch.setattr(cloud_drive, "LONGEST", 12.0)
     uri = f"sim:cloud?file={files / 'plot.laz'}"

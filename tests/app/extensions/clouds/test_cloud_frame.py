@@ -286,6 +286,7 @@ def real(shared_data: Path, name: str, cut: float | None = None, share: float = 
     return points if cut is None else points[points[:, 2] < np.percentile(points[:, 2], 1) + cut]
 
 
+@pytest.mark.slow_after(3)
 @pytest.mark.parametrize("name", ["pine_plot", "LPine1_demo", "MLS_Clip"])
 @pytest.mark.parametrize(
     ("up", "share"), [("z", 1.0), ("-z", 1.0), ("y", 1.0), ("-x", 1.0), ("z", 0.3), ("x", 0.3), ("-y", 0.3)]
@@ -352,6 +353,7 @@ def test_real_plots_stay_as_they_are(shared_data):
         assert about.warnings == ()
 
 
+@pytest.mark.slow
 def test_feet_that_are_taken_as_metres_are_doubted(tmp_path, shared_data, capsys):
     np.save(tmp_path / "feet.npy", whole(shared_data / "forest" / "MLS_Clip.laz") / FT)
     mapped = ["map", str(tmp_path / "feet.npy"), "--as", "cloud", "--out", str(tmp_path / "out"), "--force"]

@@ -21,6 +21,7 @@ numbers = st.floats(-1e3, 1e3)
 angles = st.floats(-1.5, 1.5)
 
 
+@pytest.mark.slow
 def test_the_cloud_of_a_run_with_lidar_odometry_registers_no_scan_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -96,6 +96,7 @@ def test_columns_and_rows_of_a_sensor_are_a_scan(tmp_path, points, sweep):
     assert not is_cloud(str(tmp_path / "d.npy"))
 
 
+@pytest.mark.slow
 def test_real_scans_and_clouds(shared_data, tmp_path):
     scans = [
         *shared_data.glob("velodyne/**/*.pcd"),
@@ -113,6 +114,7 @@ def test_real_scans_and_clouds(shared_data, tmp_path):
         assert is_cloud(pcd(tmp_path / "plot.pcd", some - origin)), name
 
 
+@pytest.mark.slow
 def test_the_choice_of_the_user_counts_and_the_decision_is_said(tmp_path, points, sweep, capsys):
     cloud = pcd(tmp_path / "map.pcd", lio_map(points))
     scan = pcd(tmp_path / "scan.pcd", sweep)

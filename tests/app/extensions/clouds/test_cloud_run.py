@@ -129,6 +129,7 @@ def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session
     assert status.status.one_step == session.status().one_step
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("name", ["pine_plot.laz", "LPine1_demo.laz", "MLS_Clip.laz"])
 async def test_stems_of_a_cloud_begin_on_the_terrain_or_within_their_own_points(
     name: str, shared_data: Path
@@ -167,6 +168,7 @@ def nearest(frame: Frame) -> np.ndarray:
     return np.asarray(away.argmin(axis=1))
 
 
+@pytest.mark.slow
 def test_the_latest_of_several_changes_wins(session: Session) -> None:
     mapped(session)
     for revision, least in enumerate((0.10, 0.20, 0.16), start=2):
@@ -245,6 +247,7 @@ def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(sessio
         cloud_run(session).cluster_story(len(frame.clusters.verdict))
 
 
+@pytest.mark.slow
 def test_two_sets_are_compared_without_a_change_of_the_map(session: Session) -> None:
     before = mapped(session)
     few, all_of_them = session.compare([FOREST.replace({"detection.radius_min": 0.2}), FOREST])
@@ -252,6 +255,7 @@ def test_two_sets_are_compared_without_a_change_of_the_map(session: Session) -> 
     assert session.shown.frame is before
 
 
+@pytest.mark.slow
 def test_a_seek_or_another_play_leaves_the_map_as_it_is(session: Session) -> None:
     before = mapped(session)
     session.seek(5.0)

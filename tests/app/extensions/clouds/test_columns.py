@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from app.extensions.clouds.inventory.cross_sections import find_columns, strongest_first
 from app.extensions.clouds.inventory.stem_model import STEM, is_repeated
@@ -11,6 +12,7 @@ from pipeline.types.records import Verdict
 from tests.pipeline.plots import stem
 
 
+@pytest.mark.slow
 def test_a_column_is_found_in_a_cloud_of_more_than_a_million_voxels():
     """The column comes first; a full voxel map drops the voxels that were added first."""
     rng = np.random.default_rng(0)

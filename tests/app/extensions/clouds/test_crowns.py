@@ -70,6 +70,7 @@ def test_each_point_of_two_crowns_belongs_to_its_tree():
     assert (m.crowns.tree[m.whole[:, 3] < 0.2] == -1).all()
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize(
     ("reason", "change"),
     [

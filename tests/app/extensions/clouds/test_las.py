@@ -80,6 +80,7 @@ def test_a_cloud_is_mapped_into_the_files_of_a_run(tmp_path, points, crs, capsys
         assert away.max() < 0.05
 
 
+@pytest.mark.slow
 def test_the_same_cloud_gives_the_same_bytes(tmp_path, points):
     file = write_las(tmp_path / "plot.laz", points)
     for name in ("a", "b"):
@@ -188,6 +189,7 @@ def test_a_file_that_is_not_there_or_is_something_else(tmp_path, capsys):
         assert capsys.readouterr().err.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "forest" / "pine_plot.laz").exists(), reason="there is no real data")
 def test_real_plots(tmp_path, capsys):
     truth = DATA / "forest" / "pine_plot_stems.csv"

@@ -39,6 +39,7 @@ def phone_cloud(rng, slope, sigma=0.012, per_m2=3000):
     return np.concatenate([floor[near], *stems, bush(5.0, 5.0, rng, slope), bush(11.0, 6.0, rng, slope)])
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("slope", [0.0, 0.3, 0.57])
 def test_stems_that_a_phone_sees_to_different_heights_are_no_poles(slope):
     m = map_plot(Made(phone_cloud(np.random.default_rng(1), slope)), FOREST)
@@ -46,6 +47,7 @@ def test_stems_that_a_phone_sees_to_different_heights_are_no_poles(slope):
     assert np.abs(np.sort(m.trees.dbh) - np.sort(2.0 * THICK[:, 2])).max() < 0.015
 
 
+@pytest.mark.slow
 def test_stray_points_above_a_phone_cloud_are_no_view_of_crowns():
     rng = np.random.default_rng(2)
     stray = rng.uniform((0.0, 0.0, 4.0), (15.0, 15.0, 9.0), (40, 3))
@@ -53,6 +55,7 @@ def test_stray_points_above_a_phone_cloud_are_no_view_of_crowns():
     assert found(m, THICK) == (len(THICK), 0)
 
 
+@pytest.mark.slow
 def test_posts_below_crowns_stay_posts_though_they_are_more_than_the_trees():
     rng = np.random.default_rng(3)
     trees = [stem(x, y, 0.15, rng, height=9.0) for x, y in ((3.0, 3.0), (12.0, 3.0), (7.0, 12.0))]
@@ -86,6 +89,7 @@ def test_stems_of_a_sparse_and_noisy_cloud_are_found(top):
     assert abs(np.nanmean(m.trees.dbh) - 2.0 * places[:, 2].mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_the_leaning_stems_of_coppice_are_told_apart():
     """Four stems of 8 to 11 cm from one stool, 0.5 m from one another at breast height, on a slope."""
     rng = np.random.default_rng(5)
@@ -117,6 +121,7 @@ def giant(rng, radius, height=2.6):
     ]
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("radius", [0.65, 0.8, 0.95, 1.2])
 def test_a_giant_tree_is_measured(radius):
     m = map_plot(Made(np.concatenate(giant(np.random.default_rng(6), radius))), FOREST)
@@ -148,6 +153,7 @@ def test_a_section_through_a_plot_is_told(wide, turn, is_section):
     assert any(text.startswith(SECTION) for text in m.warnings) == is_section
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(
     ("low", "high", "is_slice"), [(1.2, 1.4, True), (1.0, 1.6, True), (0.5, 2.5, False), (-1.0, 1.0, False)]
 )
@@ -158,6 +164,7 @@ def test_a_slice_of_stems_without_ground_is_told(low, high, is_slice):
     assert any(text.startswith(SLICE) for text in m.warnings) == is_slice
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(("radius", "height"), [(0.3, 0.9), (0.95, 0.9), (0.3, 1.2)])
 def test_a_low_stump_is_a_stump(radius, height):
     rng = np.random.default_rng(8)

@@ -21,6 +21,7 @@ def errors(found, truth):
     return away.argmin(axis=1), away.min(axis=1)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(("slope", "sigma"), [(0.0, 0.003), (0.35, 0.005), (0.6, 0.01)])
 def test_stems_of_known_places_and_diameters_are_found(slope, sigma):
     m = map_plot(Made(plot(np.random.default_rng(1), slope=slope, sigma=sigma)), FOREST)
@@ -31,6 +32,7 @@ def test_stems_of_known_places_and_diameters_are_found(slope, sigma):
     assert np.abs(m.trees.dbh[row] - 2.0 * PLACES[:, 2]).max() < 4.0 * np.nanmax(m.trees.dbh_sigma)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("slope", [0.0, 0.35])
 def test_stems_are_found_in_a_cloud_without_ground_returns(slope):
     """Only the feet of the stems show the ground; everywhere else, the lowest returns are crowns."""
@@ -48,6 +50,7 @@ def test_stems_are_found_in_a_cloud_without_ground_returns(slope):
     assert to_stem.max() < 0.03
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("height", [3.0, 4.0, 5.0])
 @pytest.mark.parametrize(
     ("slope", "waves"),
@@ -112,6 +115,7 @@ def test_undergrowth_at_the_foot_does_not_hide_a_stem():
     assert np.hypot(*(m.trees.position[0] - 3.0)) < 0.03
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("slope", [0.0, 0.5])
 def test_the_ground_is_found_below_noise_and_bushes(slope):
     m = map_plot(Made(plot(np.random.default_rng(6), slope=slope)), FOREST)
@@ -121,6 +125,7 @@ def test_the_ground_is_found_below_noise_and_bushes(slope):
     assert np.percentile(np.abs(off), 95) < 0.15
 
 
+@pytest.mark.slow
 def test_the_parts_in_which_a_cloud_comes_change_nothing():
     points = plot(np.random.default_rng(7), per_m2=600)
     a, b = (map_plot(Made(points, part=part), FOREST) for part in (10_000, 1_000_000))
@@ -147,6 +152,7 @@ CANOPY = np.random.default_rng(1).uniform(0.0, 10.0, (60_000, 3)) * (1.0, 1.0, 0
 LOW = np.random.default_rng(2).uniform(0.0, 10.0, (60_000, 3)) * (1.0, 1.0, 0.01)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(
     ("points", "warns"),
     [
@@ -178,6 +184,7 @@ def test_a_stem_that_the_border_of_the_plot_cuts_has_no_diameter_from_less_than_
     assert len(told) == 0 or cut > 2.9
 
 
+@pytest.mark.slow
 def test_two_million_points_are_a_plot_like_any_other():
     points = np.resize(plot(np.random.default_rng(10), per_m2=600), (2_000_000, 3))
     points += np.random.default_rng(11).normal(0.0, 0.002, points.shape)

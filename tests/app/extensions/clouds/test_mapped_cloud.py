@@ -15,6 +15,7 @@ from pipeline.geometry.poses import Pose2
 from tests.app.cli.test_commands import stemmap
 
 
+@pytest.mark.slow
 def test_the_cloud_of_a_drive_has_its_trees_and_its_ground(tmp_path, capsys):
     run = tmp_path / "run"
     assert stemmap(capsys, "map", "sim:stand?duration=6", "--out", run).code == 0
@@ -83,6 +84,7 @@ def test_a_source_that_is_gone_or_a_folder_that_is_not_there_is_one_line(tmp_pat
     assert not (tmp_path / "cloud.laz").exists()
 
 
+@pytest.mark.slow
 def test_the_page_writes_the_same_bytes_and_refuses_a_live_run(tmp_path, capsys):
     run = tmp_path / "run"
     assert stemmap(capsys, "map", "sim:stand?duration=2", "--out", run).code == 0

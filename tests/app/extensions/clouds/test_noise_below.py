@@ -28,6 +28,7 @@ def noise_below(points, rng, *, depth, share):
     return np.column_stack([x, y, rng.uniform(*depth, n)])
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(
     ("depth", "share"), [((-6.0, -0.3), 0.01), ((-40.0, -5.0), 0.01), ((-4.0, -0.5), 0.01)]
 )

@@ -43,6 +43,7 @@ def nothing() -> None:
     """Do nothing."""
 
 
+@pytest.mark.slow
 def test_a_task_whose_worker_died_is_repeated_and_the_loss_is_a_warning(address, tmp_path):
     with connected(address) as pool:
         task = str(tmp_path / "killed").encode()

@@ -22,6 +22,7 @@ def shown(places: np.ndarray) -> dict[str, Any]:
     return {"trees": rows}
 
 
+@pytest.mark.slow
 async def test_a_map_is_laid_on_the_first_one_by_its_stems():
     T = Pose2(4.0, -3.0, 1.1)
     maps = {"a": ("one", shown(STEMS)), "b": ("two", shown(T.inverse().apply(STEMS[4:])))}

@@ -296,6 +296,7 @@ def test_an_unknown_forest_and_a_name_that_is_a_path_are_refused(tmp_path):
 # --- the command ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_that_was_annotated_is_learned_from(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path))
     base = tmp_path / "base.json"

@@ -48,6 +48,7 @@ def test_into_its_own_folder_too(tmp_path):
     assert len(rows(tmp_path, "path.csv")) == 40
 
 
+@pytest.mark.slow
 def test_a_second_run_finds_its_start_and_keeps_the_numbers(stand, tmp_path, capsys):
     other = "sim:stand?duration=15&seed=4&sigma=0.03&drive=1"  # the same stand seen with another noise
     assert main(["map", other, "--continue", str(stand), "--out", str(tmp_path)]) == 0
@@ -95,6 +96,7 @@ def test_the_same_recording_twice_is_warned_of(stand, tmp_path, capsys):
     assert "already part of the map" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_another_stand_is_not_found_in_the_map(stand, tmp_path, capsys):
     words = ["map", "sim:stand?duration=15&seed=9", "--continue", str(stand), "--out", str(tmp_path / "out")]
     assert main(words) == 1
@@ -111,6 +113,7 @@ def test_a_live_robot_needs_a_given_start(stand, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_start_that_is_given_is_taken(stand, tmp_path):
     words = ["map", "sim:stand?duration=3&seed=4", "--continue", str(stand), "--out", str(tmp_path)]
     assert main([*words, "--start", "0,0,0"]) == 0
@@ -137,6 +140,7 @@ def test_what_cannot_be_continued_is_said(words, code, told, tmp_path, capsys, m
     assert not Path("out").exists()
 
 
+@pytest.mark.slow
 def test_a_whole_run_has_nothing_to_resume(tmp_path, capsys):
     assert main(["map", PLAIN, "--out", str(tmp_path / "a"), "--stop-after", "40"]) == 0
     words = [

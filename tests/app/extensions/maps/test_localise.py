@@ -63,6 +63,7 @@ def test_another_drive_is_found_and_the_map_stays(stand, tmp_path, capsys):
     assert contents(stand) == before
 
 
+@pytest.mark.slow
 def test_another_stand_is_not_found_and_says_so(stand, tmp_path, capsys):
     assert main(["localise", ELSEWHERE, "--map", str(stand), "--out", str(tmp_path)]) == 3
     told = capsys.readouterr().out
@@ -90,6 +91,7 @@ def test_a_small_file_gives_the_same_place(stand, tmp_path, capsys):
     assert main(["localise", AGAIN, "--map", str(file), "--grow"]) == 1  # it has no state
 
 
+@pytest.mark.slow
 def test_a_map_grows_only_on_demand(stand, tmp_path, capsys):
     import shutil
 
@@ -107,6 +109,7 @@ def test_a_map_grows_only_on_demand(stand, tmp_path, capsys):
     assert rows(grown / "trees.csv") == after
 
 
+@pytest.mark.slow
 def test_a_doubtful_map_is_not_added_and_said(stand, tmp_path, capsys, monkeypatch):
     import shutil
 

@@ -44,6 +44,7 @@ def test_scores_are_those_of_mapping(tmp_path, capsys):
     assert (answer.scans, answer.trees) == (mapped["scans"], mapped["trees"])
 
 
+@pytest.mark.slow
 def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_looking_anew():
     run, one = ready(LONGER), Scorer()
     for changes, looks in SETS:

@@ -185,6 +185,7 @@ async def test_a_stopped_search_can_go_on_and_its_process_is_told_its_plan(tmp_p
     assert msgspec.json.decode(heard.read_bytes(), type=Plan) == PLAN
 
 
+@pytest.mark.slow
 async def test_a_real_search_is_stopped_and_keeps_what_it_found():
     search = TuneSearch(lambda _told: None)
     await search.start(msgspec.structs.replace(PLAN, trials=100_000))

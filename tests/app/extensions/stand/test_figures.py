@@ -106,6 +106,7 @@ def test_a_shared_error_moves_all_trees_across_the_minimum_diameter_together():
     assert np.std(found) == pytest.approx(np.sqrt(np.mean(np.square(told))), rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared", [0.0, 0.005])
 def test_the_number_of_a_class_is_wrong_by_about_its_standard_error(shared):
     """Diameters of drawn stands are measured with errors. The true number of a class differs from the counted
@@ -162,6 +163,7 @@ def test_equal_diameters_do_not_inflate_the_error_of_the_dominant_one():
     assert dominant == pytest.approx((20.0, 1.0 / math.sqrt(10)))
 
 
+@pytest.mark.slow
 def test_the_unseen_part_of_a_plot_has_a_sampling_error_like_that_of_drawn_stands():
     """Stands drawn at random, a quarter of the plot seen: the errors agree with the spread of the figures."""
     random = np.random.default_rng(1)
@@ -249,6 +251,7 @@ def added_to(trees, dbh):
     return replace(every, dbh_sigma=np.concatenate([trees.dbh_sigma, np.zeros(len(dbh))]), added=added)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
 def test_a_tree_that_a_person_adds_is_one_of_those_that_the_map_lacks(share):
     """Stands drawn, of which 70 % are found and a share of the others is added: the corrected stems and basal
@@ -418,6 +421,7 @@ def test_trees_without_a_volume_have_the_mean_one_by_basal_area():
     assert math.isnan(figures(trees).values["v_ha"].value)
 
 
+@pytest.mark.slow
 def test_the_error_of_volumes_is_that_of_stands_of_which_some_heights_are_seen():
     random = np.random.default_rng(6)
     errors, told = [], []
@@ -467,6 +471,7 @@ def test_an_error_of_0_is_not_known_while_detection_is_assumed():
     assert unsure.values["g_ha"].se > 0.0
 
 
+@pytest.mark.slow
 def test_trees_without_a_diameter_are_drawn_from_the_others():
     """Stands of which 8 of 50 trees are not measured: errors of the basal area and of mean diameters."""
     random = np.random.default_rng(8)
@@ -490,6 +495,7 @@ def test_errors_are_not_known_where_many_trees_have_no_diameter():
         assert f.values["g_ha"].value == pytest.approx(50 * 10.0 * math.pi / 4 * 0.09)
 
 
+@pytest.mark.slow
 def test_the_thickest_trees_are_those_of_all_of_which_some_are_measured():
     random, errors = np.random.default_rng(9), []
     for _ in range(200):

@@ -38,6 +38,7 @@ async def test_two_runs_of_one_recording_are_compared(both: Running) -> None:
     assert told["parameters"] == [{"name": "clustering.eps", "a": 0.15, "b": 0.4}]
 
 
+@pytest.mark.slow
 async def test_two_visits_are_those_of_the_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -69,6 +70,7 @@ async def test_two_visits_are_those_of_the_command(
     np.testing.assert_allclose(told["places_b"]["6"], there[5], atol=0.02)
 
 
+@pytest.mark.slow
 async def test_maps_that_do_not_fit_are_compared_without_alignment(tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
     write_run(folder / "few", [[1.0, 1.0]], [0.2])

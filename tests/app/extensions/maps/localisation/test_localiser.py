@@ -26,6 +26,7 @@ def errors(a: Pose2, b: Pose2) -> tuple[float, float]:
     return float(np.hypot(off.x, off.y)), abs(off.yaw)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_robot_is_found_and_followed(seed):
     place = stand(seed)
@@ -49,6 +50,7 @@ def test_a_third_of_the_stems_may_be_gone(seed):
     assert errors(true, got.T_map_odom)[0] < 0.4
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("seed", range(12))
 @pytest.mark.parametrize("kind", [stand, planted])
 def test_another_stand_is_never_found(kind, seed):
@@ -227,6 +229,7 @@ def test_a_fix_after_a_withdrawn_one_is_told_when_it_is_lost():
     assert Localisation(withdrawn=1).text == "not found: the stems contradicted the place that was found"
 
 
+@pytest.mark.slow
 def test_a_map_of_few_stems_is_never_said_to_be_elsewhere():
     for few in (1, 3, 6, 12):
         here = stand(3, density=0.08)

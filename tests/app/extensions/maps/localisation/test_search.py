@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from app.extensions.maps.localisation.search import MASK, MASK_NEAR, MapIndex, mask_pairs, ones
 from pipeline.loop_closure.stem_matching import cells_of
@@ -14,6 +15,7 @@ def test_ones_counts_the_bits_of_a_word():
         assert ones(np.uint64(word)) == word.bit_count()
 
 
+@pytest.mark.slow
 def test_the_mask_of_a_pair_has_the_cells_near_its_neighbours():
     place, side = stand(1, side=30.0), 0.7
     pair = np.array([[0, 1], [5, 3]], np.int32)
