@@ -31,6 +31,8 @@ UNLIKE_GAPS = 0.025
 # without one are not drawn at random. With this share, the sum of basal areas is 9 % too small if those trees
 # have 1.5 times the mean basal area of the others: 1 - 1 / (0.8 + 0.2 * 1.5).
 UNMEASURED = 0.2
+# Share of the trees that a map of stands with undergrowth lacks (docs/results.md, `sim:wild`).
+MISSED = 0.01
 FAR = 40.0  # standard deviations, beyond which a normal distribution is 0 or 1 in double precision
 
 
@@ -65,6 +67,7 @@ class PlotTrees:
         by_tape: Whether a person measured the diameter, so that it has no part of the error that the
             diameters of the map share; None if no tree is measured so.
         added: Whether a person added the tree because the map lacks it; None if no tree is.
+        confirmed: Whether a person stated that it is a tree; None if no person did of any.
     """
 
     position: Float
@@ -76,6 +79,7 @@ class PlotTrees:
     height: Float | None = None
     by_tape: Bool | None = None
     added: Bool | None = None
+    confirmed: Bool | None = None
 
     @property
     def of_map(self) -> Bool:
@@ -87,6 +91,14 @@ class PlotTrees:
         where `dbh_sigma` is unknown."""
         shared = np.minimum(np.nan_to_num(self.dbh_sigma), common)
         return shared if self.by_tape is None else np.where(self.by_tape, 0.0, shared)
+
+    def counting(self, error: float) -> Float:
+        """Return the relative counting error of each tree, shape (T,): `error`, and for trees that a person
+        confirmed, measured by tape or added at most MISSED, because they are not false."""
+        known = np.zeros(len(self.dbh), np.bool_)
+        for stated in (self.confirmed, self.by_tape, self.added):
+            known |= False if stated is None else stated
+        return np.where(known, min(MISSED, error), error)
 
     def where(self, keep: Bool) -> PlotTrees:
         """Return the rows for which `keep`, shape (T,), is true."""
@@ -113,6 +125,8 @@ class StandFigures:
         values: Dict from the names in FIGURES, which has their units, to estimates. Names that end in
             `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
             probability of detection; the others refer to the observed area.
+        counting: Dict from some of these names to the part of the standard error that is the counting error.
+            It is one error of all plots of a map.
         classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area. Empty, and
             `trees` and the other numbers of trees 0, if nothing was observed.
         warnings: Messages for the user.
@@ -126,6 +140,7 @@ class StandFigures:
     with_volume: int | None
     detection: Estimate
     values: Mapping[str, Estimate]
+    counting: Mapping[str, float] = field(default_factory=dict)
     classes: tuple[DiameterClass, ...] = ()
     warnings: tuple[str, ...] = field(default=())
 
@@ -162,10 +177,13 @@ def stand_figures(
     """Return the stand parameters of a plot.
 
     Standard errors are those of this plot, not of the stand around it: they contain the errors of the
-    diameters, of which all trees share a part (`Stand.dbh_shared_sigma`), the trees of the part that was not
-    observed, and, of corrected parameters, the trees that were not detected. A plot that is observed
-    completely, with certain detection and exact diameters of all trees, has standard errors of 0, except for
-    the parameters of the spatial pattern.
+    diameters, of which all trees share a part (`Stand.dbh_shared_sigma`), the counting error
+    (`Stand.count_error`) of false and missed trees, the trees of the part that was not observed, and, of
+    corrected parameters, the trees that were not detected. A plot that is observed completely, with certain
+    detection, exact diameters of all trees and no counting error, has standard errors of 0, except for the
+    parameters of the spatial pattern. The counting error is a share of the stems, and the same share of basal
+    area, volume and stand density index, as if false and missed trees were as thick as the others. Of trees
+    that people confirmed, measured by tape or added it is MISSED, because only missed trees remain.
 
     Args:
         trees: Trees in the observed part, of any diameter.
@@ -225,7 +243,7 @@ def stand_figures(
     p, p_se = detection
     values = dict.fromkeys(FIGURES, Estimate())
     if seen <= 0.0:
-        return StandFigures(area, 0.0, 0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
+        return StandFigures(area, 0.0, 0, 0, 0, volumes, Estimate(p, p_se), values, warnings=tuple(warnings))
     outside = outside.where(outside.of_map)  # an added tree counts in the observed part only
     every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
     plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))), 0.0)
@@ -238,6 +256,7 @@ def stand_figures(
     found = kept.of_map
     lacking = _lacking(found, p)
     standing = np.where(found, 1.0 + lacking / max(int(found.sum()), 1), 1.0)
+    uncounted, counting = kept.counting(parameters.count_error), {}
     totals = [
         ("n_ha", np.ones(n), unsure),
         ("g_ha", basal, basal_var + unsure * _basal_area(parameters.dbh_min) ** 2),
@@ -246,15 +265,19 @@ def stand_figures(
         totals.append(("v_ha", *_volumes(kept.volume, kept.volume_sigma, kept.volume_shared, basal)))
     for name, weights, variance in totals:
         total, squares = float(weights.sum()), float(np.square(weights).sum())
-        se = math.sqrt((1.0 - share) * squares + variance)
+        wrong = float(uncounted @ weights)
+        counting[name] = HECTARE / seen * wrong
+        se = math.sqrt((1.0 - share) * squares + variance + wrong**2)
         assumed = math.isnan(p_se)
         # This figure takes all trees in view as found: where that is not certain, 0 is no error of it.
         values[name] = _scaled(HECTARE / seen, total, se, assumed or p < 1.0)
         if p > 0.0:
-            of_map = weights[found]
+            of_map, wrong = weights[found], float(uncounted @ (standing * weights))
+            counting[f"{name}_corrected"] = HECTARE / seen * wrong
             fit = 0.0 if assumed else float(of_map.sum()) * p_se / p
             detected = (1.0 - share * p) * float(np.square(of_map).sum()) + variance + fit**2
-            spread = math.sqrt(detected / p**2 + (1.0 - share) * float(np.square(weights[~found]).sum()))
+            rest = (1.0 - share) * float(np.square(weights[~found]).sum())
+            spread = math.sqrt(detected / p**2 + rest + wrong**2)
             values[f"{name}_corrected"] = _scaled(HECTARE / seen, float(standing @ weights), spread, assumed)
     if _is_unlike(n, len(every) - n, share, UNLIKE):
         warnings.append(
@@ -264,6 +287,10 @@ def stand_figures(
         values = _without_errors(values)
     known = share * (n / (n + lacking) if n else 1.0)
     values.update(_diameter_figures(kept, known, seen, parameters))
+    if n:
+        density, se = values["sdi"]
+        counting["sdi"] = density * float(uncounted.mean())
+        values["sdi"] = Estimate(density, math.hypot(se, counting["sdi"]))
     if UNMEASURED * n < missing < n:
         warnings.append(
             "more than a fifth of the trees have no diameter: the errors of basal area, volume and diameters "
@@ -273,7 +300,17 @@ def stand_figures(
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _as_known(_classes(kept, trees, share, seen, parameters), values)
     return StandFigures(
-        area, seen, n, missing, heights, volumes, Estimate(p, p_se), values, classes, tuple(warnings)
+        area,
+        seen,
+        n,
+        missing,
+        heights,
+        volumes,
+        Estimate(p, p_se),
+        values,
+        counting,
+        classes,
+        tuple(warnings),
     )
 
 
@@ -357,24 +394,27 @@ def _scaled(scale: float, total: float, se: float, assumed: bool) -> Estimate:
 def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
     """Return a dict from the names in FIGURES to means over plots, with the standard error of the variation
     between plots (ratio estimator), at least that of the errors of the plots: a few plots can be alike by
-    chance. The weights are the observed areas, for `_plain` names the whole areas. The error is NaN for one
-    plot. Plots in which a value is NaN do not count; if all are NaN, so is the mean."""
+    chance. The counting error is added to it: all plots share it, so that it neither varies between them nor
+    decreases with their number. The weights are the observed areas, for `_plain` names the whole areas. The
+    error is NaN for one plot. Plots in which a value is NaN do not count; if all are NaN, so is the mean."""
     result = {}
     for name in FIGURES:
         rows = [
-            (f.area if name.endswith("_plain") else f.seen, *f.values[name])
+            (f.area if name.endswith("_plain") else f.seen, *f.values[name], f.counting.get(name, 0.0))
             for f in plots.values()
             if math.isfinite(f.values[name].value)
         ]
         if not rows:
             result[name] = Estimate()
             continue
-        weight, value, own = np.array(rows).T
+        weight, value, se, counting = np.array(rows).T
+        own = np.maximum(np.square(np.nan_to_num(se)) - np.square(counting), 0.0)
         share = weight / weight.sum()
         mean, k = float(share @ value), len(rows)
-        within = math.sqrt(float(np.square(share * np.nan_to_num(own)).sum()))
-        between = math.sqrt(k / max(k - 1, 1) * float(np.square(share * (value - mean)).sum()))
-        result[name] = Estimate(mean, max(between, within) if k > 1 else math.nan)
+        within = float(np.square(share) @ own)
+        between = k / max(k - 1, 1) * float(np.square(share * (value - mean)).sum())
+        error = math.sqrt(max(between, within) + float(share @ counting) ** 2)
+        result[name] = Estimate(mean, error if k > 1 else math.nan)
     return result
 
 
@@ -542,8 +582,8 @@ def _classes(
     """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
     included; none if no tree has a diameter. The first class begins at the minimum diameter, which makes it
     narrower unless that is a multiple of the width. Trees without a diameter are left out. The standard
-    errors contain the part of the plot out of sight and the errors of the diameters, by which trees belong to
-    another class.
+    errors contain the counting error, the part of the plot out of sight and the errors of the diameters, by
+    which trees belong to another class.
 
     Args:
         trees: Trees of the observed part from the minimum diameter.
@@ -562,11 +602,14 @@ def _classes(
     rows = []
     for k in range(first, int(of.max()) + 1):
         low, high = max(k * width, parameters.dbh_min), (k + 1) * width
-        basal, variance = _basal_areas(known.where(of == k), common)
+        inside = known.where(of == k)
+        basal, variance = _basal_areas(inside, common)
+        uncounted = inside.counting(parameters.count_error)
         unsure = _variance_of_number(every, low, high, common)
-        n_se = math.sqrt(rest * len(basal) + unsure)
+        n_se = math.sqrt(rest * len(basal) + unsure + float(uncounted.sum()) ** 2)
         middle = _basal_area(0.5 * (low + high))
-        g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance + unsure * middle**2)
+        variance += unsure * middle**2 + float(uncounted @ basal) ** 2
+        g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance)
         if not len(basal) and n_se <= NEGLIGIBLE:  # nothing tells how many the map lacks
             n_se = g_se = math.nan
         rows.append(

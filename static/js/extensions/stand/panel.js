@@ -202,7 +202,7 @@ function hint() {
   const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
   const trees = found === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${count(all, "tree")} are counted.`}${outOfSightText(unseen)}`;
   if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
-  return `Trees of the map at the shown time.${trees} ± is the standard error; false trees, and trees that neither the map nor people have, are not included. For the mean it is the variation between plots, at least the error of the plots.`;
+  return `Trees of the map at the shown time.${trees} ± is the standard error, with 6 % of the stems for false and missed trees, less for trees that people confirmed. For the mean it is the variation between plots, at least the error of the plots.`;
 }
 
 function outOfSightText(places) {
