@@ -29,7 +29,8 @@ UNLIKE_GAPS = 0.025
 # Share of trees without a diameter above which the errors of basal area, volume and diameters are not known.
 # A diameter is reported up to a certain standard deviation, which grows with the diameter, so that the trees
 # without one are not drawn at random. With this share, the sum of basal areas is 9 % too small if those trees
-# have 1.5 times the mean basal area of the others: 1 - 1 / (0.8 + 0.2 * 1.5).
+# have 1.5 times the mean basal area of the others: 1 - 1 / (0.8 + 0.2 * 1.5). The same share is used for
+# heights: the tops of short trees are hidden more often than those of tall ones.
 UNMEASURED = 0.2
 # Share of the trees that a map of stands with undergrowth lacks (docs/results.md, `sim:wild`).
 MISSED = 0.01
@@ -63,7 +64,8 @@ class PlotTrees:
         volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None if there is no volume
             formula.
         volume_shared: Part of `volume_sigma` by the error that all diameters share [m^3], or None.
-        height: Heights [m], NaN where unknown; None if no tree has one.
+        height, height_sigma: Heights and their standard deviations [m], NaN where unknown; None if no tree
+            has one.
         by_tape: Whether a person measured the diameter, so that it has no part of the error that the
             diameters of the map share; None if no tree is measured so.
         added: Whether a person added the tree because the map lacks it; None if no tree is.
@@ -77,6 +79,7 @@ class PlotTrees:
     volume_sigma: Float | None = None
     volume_shared: Float | None = None
     height: Float | None = None
+    height_sigma: Float | None = None
     by_tape: Bool | None = None
     added: Bool | None = None
     confirmed: Bool | None = None
@@ -158,6 +161,8 @@ FIGURES = {
     "dg_cm": ("Quadratic mean diameter", "cm"),
     "mean_dbh_cm": ("Mean diameter", "cm"),
     "dominant_dbh_cm": ("Dominant diameter (100 thickest per hectare)", "cm"),
+    "mean_height_m": ("Mean height", "m"),
+    "lorey_height_m": ("Lorey's mean height (weighted by basal area)", "m"),
     "sdi": ("Stand density index (Reineke)", "1/ha"),
     "nearest_neighbour_m": ("Distance to the nearest neighbour", "m"),
     "clark_evans": ("Clark-Evans index", ""),
@@ -204,8 +209,9 @@ def stand_figures(
         The stand parameters. Trees thinner than the minimum diameter do not count; those without a diameter
         do. Unknown parameters are NaN: all if no area was observed; the corrected ones if the probability is
         NaN or not above 0; basal areas and volumes if there are trees, but none has a diameter or a volume;
-        volumes without a formula; figures of diameters if no tree has a diameter; and those of the pattern
-        for fewer than two trees. `_plain` figures have no standard error. In `v_ha`, trees without a volume
+        volumes without a formula; figures of diameters if no tree has a diameter; those of heights if no tree
+        has a height, Lorey's also if none of these has a diameter; and those of the pattern for fewer than
+        two trees. `_plain` figures have no standard error. In `v_ha`, trees without a volume
         count with the mean volume by basal area of the others.
 
     Raises:
@@ -232,6 +238,12 @@ def stand_figures(
             "thicker"
         )
     heights = 0 if kept.height is None else int(np.count_nonzero(np.isfinite(kept.height)))
+    without_height = UNMEASURED * n < n - heights
+    if 0 < heights < n:
+        warnings.append(
+            f"mean heights are those of {heights} of {n} trees, and wrong if the others are shorter or taller"
+            + ("; their errors are not known" if without_height else "")
+        )
     volumes = None if kept.volume is None else int(np.count_nonzero(np.isfinite(kept.volume)))
     if volumes is not None and volumes < n:
         warnings.append(
@@ -297,6 +309,9 @@ def stand_figures(
             "are not known"
         )
         values = _without_errors(values, _OF_DIAMETERS)
+    values.update(_height_figures(kept, known, parameters.dbh_shared_sigma))
+    if without_height:
+        values = _without_errors(values, _OF_HEIGHTS)
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _as_known(_classes(kept, trees, share, seen, parameters), values)
     return StandFigures(
@@ -346,6 +361,7 @@ _OF_AREA = ("n_ha", "g_ha", "v_ha", "n_ha_corrected", "g_ha_corrected", "v_ha_co
 _OF_DIAMETERS = (
     "g_ha", "v_ha", "g_ha_corrected", "v_ha_corrected", "dg_cm", "mean_dbh_cm", "dominant_dbh_cm", "sdi",
 )  # fmt: skip
+_OF_HEIGHTS = ("mean_height_m", "lorey_height_m")
 
 
 def _without_errors(values: dict[str, Estimate], names: Sequence[str] = _OF_AREA) -> dict[str, Estimate]:
@@ -529,16 +545,43 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
     return {name: _with_error(figure, d, sigma, shared, measured * found) for name, figure in figures.items()}
 
 
+def _height_figures(trees: PlotTrees, found: float, common: float) -> dict[str, Estimate]:
+    """Return a dict from "mean_height_m" and "lorey_height_m" to estimates, without those that no tree has
+    the measurements for. Errors as in `_diameter_figures`; `common` is the shared error of diameters [m]."""
+    if trees.height is None or trees.height_sigma is None:
+        return {}
+    h = np.stack([trees.height, trees.dbh], axis=1)
+    sigma = np.nan_to_num(np.stack([trees.height_sigma, trees.dbh_sigma], axis=1))
+    shared = np.stack([np.zeros(len(h)), trees.shared(common)], axis=1)
+
+    def mean(values: Float) -> tuple[float, Float]:
+        return float(values.mean()), np.full(values.shape, 1.0 / len(values))
+
+    def lorey(values: Float) -> tuple[float, Float]:
+        height, d = values.T
+        squares = float(np.square(d).sum())
+        figure = float(np.square(d) @ height) / squares
+        return figure, np.stack([np.square(d), 2.0 * d * (height - figure)], axis=1) / squares
+
+    result = {}
+    for name, figure, columns in (("mean_height_m", mean, 1), ("lorey_height_m", lorey, 2)):
+        known = np.isfinite(h[:, :columns]).all(axis=1)
+        if known.any():
+            measured, error, of_all = (each[known, :columns] for each in (h, sigma, shared))
+            result[name] = _with_error(figure, measured, error, of_all, found * float(known.mean()))
+    return result
+
+
 def _with_error(
     figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, shared: Float, found: float
 ) -> Estimate:
     """Return a stand parameter with its standard error, which is NaN for a single tree of an incomplete plot.
 
     Args:
-        figure: Function of the diameters, shape (N,) [cm], that returns the stand parameter and its
-            derivatives with respect to the diameters, shape (N,).
-        d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
-        shared: Part of `sigma` that is one error of all diameters, shape (N,) [cm].
+        figure: Function of the measurements, in the shape of `d`, that returns the stand parameter and its
+            derivatives with respect to the measurements, in this shape.
+        d, sigma: Measurements and their standard deviations, shape (N,) or (N, K) for N trees, N at least 1.
+        shared: Part of `sigma` that is one error of all measurements, in the same shape.
         found: Share of all trees that was found, observed and measured.
     """
     n = len(d)
@@ -546,7 +589,7 @@ def _with_error(
     measured = _variance_of_sum(slope * sigma, slope * shared)
     sampled = 0.0
     if n > 1 and found < 1.0:
-        without = np.array([figure(np.delete(d, k))[0] for k in range(n)])
+        without = np.array([figure(np.delete(d, k, axis=0))[0] for k in range(n)])
         sampled = (1.0 - found) * (n - 1) / n * float(np.square(without - without.mean()).sum())
     return Estimate(value, math.sqrt(measured + sampled) if n > 1 or found >= 1.0 else math.nan)
 

@@ -255,6 +255,7 @@ def counted_trees(trees: Trees, reviews: Mapping[int, str], people: ByPeople, pa
         diameter,
         sigma,
         height=with_added(trees.height),
+        height_sigma=with_added(trees.height_sigma),
         by_tape=by_tape,
         added=np.arange(len(tape)) >= len(trees.number),
         confirmed=np.array([*confirmed, *[False] * len(people.added)], np.bool_),

@@ -475,6 +475,52 @@ def test_the_error_of_volumes_is_that_of_stands_of_which_some_heights_are_seen()
     assert np.std(errors) == pytest.approx(math.sqrt(np.mean(np.square(told))), rel=0.12)
 
 
+def with_heights(trees, height, sigma):
+    return replace(trees, height=np.array(height), height_sigma=np.where(np.isfinite(height), sigma, np.nan))
+
+
+def test_mean_heights_are_those_of_the_textbook():
+    d, height = [0.1, 0.2, 0.3] * 4, [10.0, 20.0, 25.0] * 4
+    f = figures(with_heights(trees_of(d), height, 0.5), limits=INDEPENDENT)
+    assert f.values["mean_height_m"] == pytest.approx((55.0 / 3, 0.5 / math.sqrt(12)))
+    lorey = (0.01 * 10.0 + 0.04 * 20.0 + 0.09 * 25.0) / 0.14
+    weight = np.array([0.01, 0.04, 0.09] * 4) / 0.56
+    assert f.values["lorey_height_m"] == pytest.approx((lorey, 0.5 * math.sqrt(np.square(weight).sum())))
+    assert (f.with_height, f.warnings) == (12, ())
+    unknown = figures(trees_of(d))
+    assert all(math.isnan(unknown.values[name].value) for name in ("mean_height_m", "lorey_height_m"))
+    assert unknown.warnings == ()
+    assert combined({"a": f, "b": unknown})["mean_height_m"].value == pytest.approx(55.0 / 3)
+
+
+def test_heights_of_a_part_of_the_trees_are_a_sample_of_all():
+    """Stands of which 42 of 50 heights are known, with errors of heights and diameters."""
+    random = np.random.default_rng(8)
+    names, errors, told = ("mean_height_m", "lorey_height_m"), [], []
+    for _ in range(200):
+        d = random.lognormal(math.log(0.3), 0.3, 50)
+        height = 30.0 * (1.0 - np.exp(-5.0 * d)) + random.normal(0.0, 2.0, 50)
+        seen = np.where(random.permutation(50) < 42, height + random.normal(0.0, 0.8, 50), np.nan)
+        measured = with_heights(trees_of(d + random.normal(0.0, 0.02, 50), 0.02), seen, 0.8)
+        v = figures(measured, limits=INDEPENDENT).values
+        whole = figures(with_heights(trees_of(d), height, 0.0), limits=INDEPENDENT).values
+        errors.append([v[name].value - whole[name].value for name in names])
+        told.append([v[name].se for name in names])
+    ratio = np.std(errors, axis=0) / np.sqrt(np.square(told).mean(axis=0))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+
+
+def test_few_heights_are_a_warning_with_their_number_and_have_no_error():
+    for missing, is_known in ((10, True), (11, False)):
+        height = np.where(np.arange(50) < missing, np.nan, 20.0)
+        f = figures(with_heights(trees_of([0.3] * 50), height, 0.5))
+        (text,) = f.warnings
+        assert f"mean heights are those of {50 - missing} of 50 trees" in text
+        assert ("errors are not known" in text) != is_known
+        assert f.values["lorey_height_m"].value == pytest.approx(20.0)
+        assert math.isfinite(f.values["lorey_height_m"].se) == is_known
+
+
 def test_plain_figures_of_several_plots_refer_to_their_whole_area():
     inside = PlotTrees(np.array([[1.0, 1.0], [4.0, 4.0]]), np.full(2, 0.2), np.full(2, 0.01))
     nothing = inside.where(np.zeros(2, np.bool_))

@@ -249,6 +249,25 @@ def test_a_small_error_is_not_rounded_to_0_and_one_that_is_not_known_is_explaine
     assert catalogue_of("en")["unknown_error"] not in page_of(capsys, run, tmp_path / "f.html")
 
 
+def test_a_report_has_mean_heights_and_their_number_of_trees(run, tmp_path, capsys):
+    assert "Loreysche" not in page_of(capsys, run, tmp_path / "none.html", ["--language", "de"])
+    cloud = grid_run(tmp_path / "run")
+    rows = [line.split(",") for line in (cloud / "trees.csv").read_text().splitlines()]
+    columns = [rows[0].index(name) for name in ("height_m", "sigma_height_m")]
+    for row in rows[1:91]:
+        row[columns[0]], row[columns[1]] = "21.40", "0.30"
+    (cloud / "trees.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
+    words = ["--rectangle", "10,10,10,10", "--language", "de"]
+    text = page_of(capsys, cloud, tmp_path / "r.html", words)
+    assert "Bäume mit Höhe: 90" in text
+    assert "die mittleren Höhen sind die von 90 von 100 Bäumen" in text
+    assert re.search(r"<td>Mittlere Höhe hm</td><td>21,4</td><td>0,03</td>", text.replace("21,40", "21,4"))
+    head, row = re.findall(r"<tr>(<t[hd]>(?:Fläche|1)<.*)</tr>", text)[:2]
+    titles, cells = (re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in (head, row))
+    assert len(titles) == len(cells)
+    assert cells[titles.index("hL m")].startswith("21,4")
+
+
 def test_plots_have_their_dominant_diameter(tmp_path, capsys):
     run = grid_run(tmp_path / "run")
     rows = (run / "trees.csv").read_text().splitlines()
