@@ -32,7 +32,8 @@ UNLIKE_GAPS = 0.025
 # have 1.5 times the mean basal area of the others: 1 - 1 / (0.8 + 0.2 * 1.5). The same share is used for
 # heights: the tops of short trees are hidden more often than those of tall ones.
 UNMEASURED = 0.2
-# Share of the trees that a map of stands with undergrowth lacks (docs/results.md, `sim:wild`).
+# Share of the trees that a map of stands with undergrowth lacks: 5 of about 420
+# (docs/results.md, `sim:wild`).
 MISSED = 0.01
 FAR = 40.0  # standard deviations, beyond which a normal distribution is 0 or 1 in double precision
 
@@ -187,8 +188,9 @@ def stand_figures(
     corrected parameters, the trees that were not detected. A plot that is observed completely, with certain
     detection, exact diameters of all trees and no counting error, has standard errors of 0, except for the
     parameters of the spatial pattern. The counting error is a share of the stems, and the same share of basal
-    area, volume and stand density index, as if false and missed trees were as thick as the others. Of trees
-    that people confirmed, measured by tape or added it is MISSED, because only missed trees remain.
+    area, volume and stand density index, because false trees rarely have a diameter and count with the mean
+    basal area. Of trees that people confirmed, measured by tape or added it is MISSED, because only missed
+    trees remain.
 
     Args:
         trees: Trees in the observed part, of any diameter.
