@@ -314,8 +314,11 @@ class Dashboard:
         self.scene.show_parameters(state.parameters, state.preset)
 
     def _broadcast_events(self) -> None:
-        """Broadcast the events of the run."""
-        self.live.publish("events", {**self.events.as_plain(), "start_s": self.start_ns / 1e9})
+        """Broadcast the events of the run, and record those of a live run."""
+        log = {**self.events.as_plain(), "start_s": self.start_ns / 1e9}
+        self.live.publish("events", log)
+        if self.status.live:
+            self.run_recorder.logged(log)
 
     async def _send_parameters(self) -> None:
         """Send the parameters in force to the worker."""

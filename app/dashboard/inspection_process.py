@@ -19,7 +19,7 @@ import msgspec
 from app.common.child_process import ParentConnection, run_child
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
-from app.robot.topics import Publisher, countable
+from app.robot.topics import Choice, Publisher, choose, countable
 from app.sources.live_address import is_live, parse_address
 from app.sources.one_step import is_one_step, open_one_step
 from app.sources.opening import MEMORY_LIMIT, open_source
@@ -274,9 +274,10 @@ def recorded(uri: str) -> dict[str, Any]:
 
 def heard(uri: str) -> dict[str, Any]:
     """Return the topics of a live robot, at most MOST_TOPICS, in the form of `recorded`: see `_counted`; the
-    kind is "live" and `mount` None. It waits for topics, up to LISTEN_S or 1.5 s after the last new one, then
-    counts messages of the usable topics for COUNT_S. Without topics, also because there is no connection, the
-    list is empty and there is a warning.
+    kind is "live" and `mount` None. The role of a topic is that in which a run of this address would read it,
+    see `choose`; without any if a topic that the address names has another type, which is a warning. It waits
+    for topics, up to LISTEN_S or 1.5 s after the last new one, then counts messages of the usable topics for
+    COUNT_S. Without topics, also because there is no connection, the list is empty and there is a warning.
 
     Raises:
         SourceError: The address is invalid.
@@ -295,25 +296,41 @@ def heard(uri: str) -> dict[str, Any]:
             link.subscribe(listened)
             time.sleep(COUNT_S)
         numbers = {channel.number for channel in listened}
-        topics = [_counted(each, inbox.heard(k), k in numbers) for k, each in enumerate(known[:MOST_TOPICS])]
-        warnings = [] if topics else [f"no topic was announced within {LISTEN_S:.0f} s"]
+        warnings = [] if known else [f"no topic was announced within {LISTEN_S:.0f} s"]
+        try:
+            read = _roles_read(choose(known, address.robot, address.topics, uri), address.topics.get("pose"))
+        except SourceError as error:
+            read, warnings = {}, [str(error)]
+        topics = [
+            _counted(each, inbox.heard(k), k in numbers, read.get(each.topic, ""))
+            for k, each in enumerate(known[:MOST_TOPICS])
+        ]
         return {"kind": "live", "topics": topics, "mount": None, "warnings": warnings}
 
 
-def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, Any]:
+def _roles_read(choice: Choice | None, pose: str | None) -> dict[str, str]:
+    """Return a dict from the topics that are read to their roles; `pose` is the one that is named for it."""
+    channels = () if choice is None else choice.channels
+    roles = {c.topic: "pose" if c.topic == pose else _ROLES.get(c.msgtype, "transforms") for c in channels}
+    return roles | {c.topic: "camera" for c in (choice.camera if choice else ())}
+
+
+def _counted(publisher: Publisher, heard: Heard, listened: bool, role: str) -> dict[str, Any]:
     """Return the description of a topic as a dict: the fields of a `RecordedTopic`, of which `messages` is
-    the number of counted messages (None if they were not counted); `seconds`, the time of counting [s]; and
-    `rate_hz`.
+    the number of counted messages (None if they were not counted) and `why_not`, also of a topic that is
+    read, whether it is silent; `seconds`, the time of counting [s]; and `rate_hz`.
 
     Args:
         publisher: The topic.
         heard: Number and times of the messages of the topic.
         listened: Whether its messages were counted.
+        role: Role in which it is read; "" if it is not.
     """
     why = ""
     if listened and not heard.messages and not publisher.topic.endswith("tf_static"):
         why = f"silent for {COUNT_S:g} s"
-    topic = RecordedTopic(publisher.topic, publisher.msgtype, 0, "", _ROLES.get(publisher.msgtype, ""), why)
+    fits = _ROLES.get(publisher.msgtype, "")
+    topic = RecordedTopic(publisher.topic, publisher.msgtype, 0, role, fits, why)
     counted = heard.messages if listened else None
     return {**asdict(topic), "details": [], "messages": counted, "seconds": COUNT_S, "rate_hz": heard.rate_hz}
 

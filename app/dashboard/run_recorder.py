@@ -52,6 +52,8 @@ class _Page:
         scores: Scores of `best`; None if there are none.
         dirty: Whether `best` is not written.
         changes: Changes of parameters that are not written.
+        recordings: Absolute paths of the files to which the run was recorded.
+        log: Events of a live run, see `RunRecorder.logged`; None without any.
         writer: Task that writes the record.
         ended: Set when the run is left.
         complete: Whether the run came to its end and its result files are not written.
@@ -66,6 +68,7 @@ class _Page:
     dirty: bool = False
     changes: list[Change] = field(default_factory=list)
     recordings: list[str] = field(default_factory=list)
+    log: dict[str, Any] | None = None
     writer: asyncio.Task[None] | None = None
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     complete: bool = False
@@ -150,6 +153,16 @@ class RunRecorder:
             page.dirty = True
             self._soon(page)
 
+    def logged(self, log: dict[str, Any]) -> None:
+        """Record the events of a live run; nothing without a record or without events.
+
+        Args:
+            log: `events` (see `Events.as_plain`), and `start_s`, the time of the first scan [s since 1970].
+        """
+        if self._page is not None and log["events"]:
+            self._page.log, self._page.dirty = log, True
+            self._soon(self._page)
+
     def scored(self, scores: dict[str, Any] | None) -> None:
         """Record the score of the scan that was displayed last; ignored for None, and if that scan is not the
         farthest one."""
@@ -231,7 +244,7 @@ class RunRecorder:
         page.dirty, page.changes = False, []
 
         def work(store: Store) -> None:
-            figures = _figures_of(state, scores, page.all_scans)
+            figures = _figures_of(state, scores, page.all_scans, page.log)
             if page.record is None:
                 page.record = store.book.begin(page.beginning, figures)
             else:
@@ -278,14 +291,18 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
     return content.getvalue()
 
 
-def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None) -> RunFigures:
+def _figures_of(
+    state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None, log: dict[str, Any] | None
+) -> RunFigures:
     """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
     (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth), in the
-    coordinates of the files, which are those of the map plus `offset`; and `recordings`, see `ShownRun`.
+    coordinates of the files, which are those of the map plus `offset`; `recordings`, see `ShownRun`; and
+    `log`.
 
     Args:
         state, scores: The state, and its scores; None if there are none.
         all_scans: Number of scans of the source; None if unknown.
+        log: Events of a live run, see `RunRecorder.logged`; None of other runs.
     """
     shown = state.shown
     trees = trees_payload(in_file(shown.frame.trees, state.one_step), start_ns=state.start_ns)
@@ -306,6 +323,7 @@ def _figures_of(state: ShownRun, scores: dict[str, Any] | None, all_scans: int |
             "truth": None if truth is None else truth["trees"],
             "offset": list(state.offset[:2]),
             "recordings": list(state.recordings),
+            "log": log,
         },
     )
 

@@ -80,6 +80,9 @@ def test_runs_are_stored_renamed_deleted_and_replayed(own: Dashboard, tmp_path: 
     def as_live(route: Route) -> None:
         run = route.fetch().json()
         run["map"]["recordings"] = ["/data/north.mcap", "/data/south.mcap"]
+        stop = {"t": 3.0, "kind": "stop", "text": "Obstacle in the stop zone", "for_s": 2.5, "noted_s": 1.7e9}
+        tree = {"t": 4.0, "kind": "tree", "text": "Tree 1 mapped"}
+        run["map"]["log"] = {"events": [stop, tree], "start_s": 0.0}
         route.fulfill(json={**run, "live": True})
 
     page.route("**/api/runs/*", as_live)
@@ -89,6 +92,8 @@ def test_runs_are_stored_renamed_deleted_and_replayed(own: Dashboard, tmp_path: 
     expect(page.locator("#run-recordings")).to_have_text("Recorded tonorth.mcapsouth.mcap")
     south = page.get_by_role("button", name="south.mcap")
     expect(south).to_have_attribute("title", re.compile("^/data/south.mcap\n"))
+    expect(page.locator("#run-log tbody tr")).to_have_count(1)
+    expect(page.locator("#run-log tbody tr")).to_contain_text("2.50 sObstacle in the stop zone")
     page.unroute("**/api/runs/*")
     rows.nth(1).get_by_role("button").click()
     page.get_by_role("button", name="Replay").click()

@@ -29,8 +29,12 @@ UNLIKE_GAPS = 0.025
 # Share of trees without a diameter above which the errors of basal area, volume and diameters are not known.
 # A diameter is reported up to a certain standard deviation, which grows with the diameter, so that the trees
 # without one are not drawn at random. With this share, the sum of basal areas is 9 % too small if those trees
-# have 1.5 times the mean basal area of the others: 1 - 1 / (0.8 + 0.2 * 1.5).
+# have 1.5 times the mean basal area of the others: 1 - 1 / (0.8 + 0.2 * 1.5). The same share is used for
+# heights: the tops of short trees are hidden more often than those of tall ones.
 UNMEASURED = 0.2
+# Share of the trees that a map of stands with undergrowth lacks: 5 of about 420
+# (docs/results.md, `sim:wild`).
+MISSED = 0.01
 FAR = 40.0  # standard deviations, beyond which a normal distribution is 0 or 1 in double precision
 
 
@@ -61,10 +65,12 @@ class PlotTrees:
         volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None if there is no volume
             formula.
         volume_shared: Part of `volume_sigma` by the error that all diameters share [m^3], or None.
-        height: Heights [m], NaN where unknown; None if no tree has one.
+        height, height_sigma: Heights and their standard deviations [m], NaN where unknown; None if no tree
+            has one.
         by_tape: Whether a person measured the diameter, so that it has no part of the error that the
             diameters of the map share; None if no tree is measured so.
         added: Whether a person added the tree because the map lacks it; None if no tree is.
+        confirmed: Whether a person stated that it is a tree; None if no person did of any.
     """
 
     position: Float
@@ -74,8 +80,10 @@ class PlotTrees:
     volume_sigma: Float | None = None
     volume_shared: Float | None = None
     height: Float | None = None
+    height_sigma: Float | None = None
     by_tape: Bool | None = None
     added: Bool | None = None
+    confirmed: Bool | None = None
 
     @property
     def of_map(self) -> Bool:
@@ -87,6 +95,14 @@ class PlotTrees:
         where `dbh_sigma` is unknown."""
         shared = np.minimum(np.nan_to_num(self.dbh_sigma), common)
         return shared if self.by_tape is None else np.where(self.by_tape, 0.0, shared)
+
+    def counting(self, error: float) -> Float:
+        """Return the relative counting error of each tree, shape (T,): `error`, and for trees that a person
+        confirmed, measured by tape or added at most MISSED, because they are not false."""
+        known = np.zeros(len(self.dbh), np.bool_)
+        for stated in (self.confirmed, self.by_tape, self.added):
+            known |= False if stated is None else stated
+        return np.where(known, min(MISSED, error), error)
 
     def where(self, keep: Bool) -> PlotTrees:
         """Return the rows for which `keep`, shape (T,), is true."""
@@ -113,6 +129,8 @@ class StandFigures:
         values: Dict from the names in FIGURES, which has their units, to estimates. Names that end in
             `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
             probability of detection; the others refer to the observed area.
+        counting: Dict from some of these names to the part of the standard error that is the counting error.
+            It is one error of all plots of a map.
         classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area. Empty, and
             `trees` and the other numbers of trees 0, if nothing was observed.
         warnings: Messages for the user.
@@ -126,6 +144,7 @@ class StandFigures:
     with_volume: int | None
     detection: Estimate
     values: Mapping[str, Estimate]
+    counting: Mapping[str, float] = field(default_factory=dict)
     classes: tuple[DiameterClass, ...] = ()
     warnings: tuple[str, ...] = field(default=())
 
@@ -143,6 +162,8 @@ FIGURES = {
     "dg_cm": ("Quadratic mean diameter", "cm"),
     "mean_dbh_cm": ("Mean diameter", "cm"),
     "dominant_dbh_cm": ("Dominant diameter (100 thickest per hectare)", "cm"),
+    "mean_height_m": ("Mean height", "m"),
+    "lorey_height_m": ("Lorey's mean height (weighted by basal area)", "m"),
     "sdi": ("Stand density index (Reineke)", "1/ha"),
     "nearest_neighbour_m": ("Distance to the nearest neighbour", "m"),
     "clark_evans": ("Clark-Evans index", ""),
@@ -162,10 +183,14 @@ def stand_figures(
     """Return the stand parameters of a plot.
 
     Standard errors are those of this plot, not of the stand around it: they contain the errors of the
-    diameters, of which all trees share a part (`Stand.dbh_shared_sigma`), the trees of the part that was not
-    observed, and, of corrected parameters, the trees that were not detected. A plot that is observed
-    completely, with certain detection and exact diameters of all trees, has standard errors of 0, except for
-    the parameters of the spatial pattern.
+    diameters, of which all trees share a part (`Stand.dbh_shared_sigma`), the counting error
+    (`Stand.count_error`) of false and missed trees, the trees of the part that was not observed, and, of
+    corrected parameters, the trees that were not detected. A plot that is observed completely, with certain
+    detection, exact diameters of all trees and no counting error, has standard errors of 0, except for the
+    parameters of the spatial pattern. The counting error is a share of the stems, and the same share of basal
+    area, volume and stand density index, because false trees rarely have a diameter and count with the mean
+    basal area. Of trees that people confirmed, measured by tape or added it is MISSED, because only missed
+    trees remain.
 
     Args:
         trees: Trees in the observed part, of any diameter.
@@ -186,8 +211,9 @@ def stand_figures(
         The stand parameters. Trees thinner than the minimum diameter do not count; those without a diameter
         do. Unknown parameters are NaN: all if no area was observed; the corrected ones if the probability is
         NaN or not above 0; basal areas and volumes if there are trees, but none has a diameter or a volume;
-        volumes without a formula; figures of diameters if no tree has a diameter; and those of the pattern
-        for fewer than two trees. `_plain` figures have no standard error. In `v_ha`, trees without a volume
+        volumes without a formula; figures of diameters if no tree has a diameter; those of heights if no tree
+        has a height, Lorey's also if none of these has a diameter; and those of the pattern for fewer than
+        two trees. `_plain` figures have no standard error. In `v_ha`, trees without a volume
         count with the mean volume by basal area of the others.
 
     Raises:
@@ -214,6 +240,12 @@ def stand_figures(
             "thicker"
         )
     heights = 0 if kept.height is None else int(np.count_nonzero(np.isfinite(kept.height)))
+    without_height = UNMEASURED * n < n - heights
+    if 0 < heights < n:
+        warnings.append(
+            f"mean heights are those of {heights} of {n} trees, and wrong if the others are shorter or taller"
+            + ("; their errors are not known" if without_height else "")
+        )
     volumes = None if kept.volume is None else int(np.count_nonzero(np.isfinite(kept.volume)))
     if volumes is not None and volumes < n:
         warnings.append(
@@ -225,7 +257,7 @@ def stand_figures(
     p, p_se = detection
     values = dict.fromkeys(FIGURES, Estimate())
     if seen <= 0.0:
-        return StandFigures(area, 0.0, 0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
+        return StandFigures(area, 0.0, 0, 0, 0, volumes, Estimate(p, p_se), values, warnings=tuple(warnings))
     outside = outside.where(outside.of_map)  # an added tree counts in the observed part only
     every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
     plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))), 0.0)
@@ -238,6 +270,7 @@ def stand_figures(
     found = kept.of_map
     lacking = _lacking(found, p)
     standing = np.where(found, 1.0 + lacking / max(int(found.sum()), 1), 1.0)
+    uncounted, counting = kept.counting(parameters.count_error), {}
     totals = [
         ("n_ha", np.ones(n), unsure),
         ("g_ha", basal, basal_var + unsure * _basal_area(parameters.dbh_min) ** 2),
@@ -246,15 +279,19 @@ def stand_figures(
         totals.append(("v_ha", *_volumes(kept.volume, kept.volume_sigma, kept.volume_shared, basal)))
     for name, weights, variance in totals:
         total, squares = float(weights.sum()), float(np.square(weights).sum())
-        se = math.sqrt((1.0 - share) * squares + variance)
+        wrong = float(uncounted @ weights)
+        counting[name] = HECTARE / seen * wrong
+        se = math.sqrt((1.0 - share) * squares + variance + wrong**2)
         assumed = math.isnan(p_se)
         # This figure takes all trees in view as found: where that is not certain, 0 is no error of it.
         values[name] = _scaled(HECTARE / seen, total, se, assumed or p < 1.0)
         if p > 0.0:
-            of_map = weights[found]
+            of_map, wrong = weights[found], float(uncounted @ (standing * weights))
+            counting[f"{name}_corrected"] = HECTARE / seen * wrong
             fit = 0.0 if assumed else float(of_map.sum()) * p_se / p
             detected = (1.0 - share * p) * float(np.square(of_map).sum()) + variance + fit**2
-            spread = math.sqrt(detected / p**2 + (1.0 - share) * float(np.square(weights[~found]).sum()))
+            rest = (1.0 - share) * float(np.square(weights[~found]).sum())
+            spread = math.sqrt(detected / p**2 + rest + wrong**2)
             values[f"{name}_corrected"] = _scaled(HECTARE / seen, float(standing @ weights), spread, assumed)
     if _is_unlike(n, len(every) - n, share, UNLIKE):
         warnings.append(
@@ -264,16 +301,33 @@ def stand_figures(
         values = _without_errors(values)
     known = share * (n / (n + lacking) if n else 1.0)
     values.update(_diameter_figures(kept, known, seen, parameters))
+    if n:
+        density, se = values["sdi"]
+        counting["sdi"] = density * float(uncounted.mean())
+        values["sdi"] = Estimate(density, math.hypot(se, counting["sdi"]))
     if UNMEASURED * n < missing < n:
         warnings.append(
             "more than a fifth of the trees have no diameter: the errors of basal area, volume and diameters "
             "are not known"
         )
         values = _without_errors(values, _OF_DIAMETERS)
+    values.update(_height_figures(kept, known, parameters.dbh_shared_sigma))
+    if without_height:
+        values = _without_errors(values, _OF_HEIGHTS)
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _as_known(_classes(kept, trees, share, seen, parameters), values)
     return StandFigures(
-        area, seen, n, missing, heights, volumes, Estimate(p, p_se), values, classes, tuple(warnings)
+        area,
+        seen,
+        n,
+        missing,
+        heights,
+        volumes,
+        Estimate(p, p_se),
+        values,
+        counting,
+        classes,
+        tuple(warnings),
     )
 
 
@@ -309,6 +363,7 @@ _OF_AREA = ("n_ha", "g_ha", "v_ha", "n_ha_corrected", "g_ha_corrected", "v_ha_co
 _OF_DIAMETERS = (
     "g_ha", "v_ha", "g_ha_corrected", "v_ha_corrected", "dg_cm", "mean_dbh_cm", "dominant_dbh_cm", "sdi",
 )  # fmt: skip
+_OF_HEIGHTS = ("mean_height_m", "lorey_height_m")
 
 
 def _without_errors(values: dict[str, Estimate], names: Sequence[str] = _OF_AREA) -> dict[str, Estimate]:
@@ -357,24 +412,27 @@ def _scaled(scale: float, total: float, se: float, assumed: bool) -> Estimate:
 def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
     """Return a dict from the names in FIGURES to means over plots, with the standard error of the variation
     between plots (ratio estimator), at least that of the errors of the plots: a few plots can be alike by
-    chance. The weights are the observed areas, for `_plain` names the whole areas. The error is NaN for one
-    plot. Plots in which a value is NaN do not count; if all are NaN, so is the mean."""
+    chance. The counting error is added to it: all plots share it, so that it neither varies between them nor
+    decreases with their number. The weights are the observed areas, for `_plain` names the whole areas. The
+    error is NaN for one plot. Plots in which a value is NaN do not count; if all are NaN, so is the mean."""
     result = {}
     for name in FIGURES:
         rows = [
-            (f.area if name.endswith("_plain") else f.seen, *f.values[name])
+            (f.area if name.endswith("_plain") else f.seen, *f.values[name], f.counting.get(name, 0.0))
             for f in plots.values()
             if math.isfinite(f.values[name].value)
         ]
         if not rows:
             result[name] = Estimate()
             continue
-        weight, value, own = np.array(rows).T
+        weight, value, se, counting = np.array(rows).T
+        own = np.maximum(np.square(np.nan_to_num(se)) - np.square(counting), 0.0)
         share = weight / weight.sum()
         mean, k = float(share @ value), len(rows)
-        within = math.sqrt(float(np.square(share * np.nan_to_num(own)).sum()))
-        between = math.sqrt(k / max(k - 1, 1) * float(np.square(share * (value - mean)).sum()))
-        result[name] = Estimate(mean, max(between, within) if k > 1 else math.nan)
+        within = float(np.square(share) @ own)
+        between = k / max(k - 1, 1) * float(np.square(share * (value - mean)).sum())
+        error = math.sqrt(max(between, within) + float(share @ counting) ** 2)
+        result[name] = Estimate(mean, error if k > 1 else math.nan)
     return result
 
 
@@ -489,16 +547,43 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
     return {name: _with_error(figure, d, sigma, shared, measured * found) for name, figure in figures.items()}
 
 
+def _height_figures(trees: PlotTrees, found: float, common: float) -> dict[str, Estimate]:
+    """Return a dict from "mean_height_m" and "lorey_height_m" to estimates, without those that no tree has
+    the measurements for. Errors as in `_diameter_figures`; `common` is the shared error of diameters [m]."""
+    if trees.height is None or trees.height_sigma is None:
+        return {}
+    h = np.stack([trees.height, trees.dbh], axis=1)
+    sigma = np.nan_to_num(np.stack([trees.height_sigma, trees.dbh_sigma], axis=1))
+    shared = np.stack([np.zeros(len(h)), trees.shared(common)], axis=1)
+
+    def mean(values: Float) -> tuple[float, Float]:
+        return float(values.mean()), np.full(values.shape, 1.0 / len(values))
+
+    def lorey(values: Float) -> tuple[float, Float]:
+        height, d = values.T
+        squares = float(np.square(d).sum())
+        figure = float(np.square(d) @ height) / squares
+        return figure, np.stack([np.square(d), 2.0 * d * (height - figure)], axis=1) / squares
+
+    result = {}
+    for name, figure, columns in (("mean_height_m", mean, 1), ("lorey_height_m", lorey, 2)):
+        known = np.isfinite(h[:, :columns]).all(axis=1)
+        if known.any():
+            measured, error, of_all = (each[known, :columns] for each in (h, sigma, shared))
+            result[name] = _with_error(figure, measured, error, of_all, found * float(known.mean()))
+    return result
+
+
 def _with_error(
     figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, shared: Float, found: float
 ) -> Estimate:
     """Return a stand parameter with its standard error, which is NaN for a single tree of an incomplete plot.
 
     Args:
-        figure: Function of the diameters, shape (N,) [cm], that returns the stand parameter and its
-            derivatives with respect to the diameters, shape (N,).
-        d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
-        shared: Part of `sigma` that is one error of all diameters, shape (N,) [cm].
+        figure: Function of the measurements, in the shape of `d`, that returns the stand parameter and its
+            derivatives with respect to the measurements, in this shape.
+        d, sigma: Measurements and their standard deviations, shape (N,) or (N, K) for N trees, N at least 1.
+        shared: Part of `sigma` that is one error of all measurements, in the same shape.
         found: Share of all trees that was found, observed and measured.
     """
     n = len(d)
@@ -506,7 +591,7 @@ def _with_error(
     measured = _variance_of_sum(slope * sigma, slope * shared)
     sampled = 0.0
     if n > 1 and found < 1.0:
-        without = np.array([figure(np.delete(d, k))[0] for k in range(n)])
+        without = np.array([figure(np.delete(d, k, axis=0))[0] for k in range(n)])
         sampled = (1.0 - found) * (n - 1) / n * float(np.square(without - without.mean()).sum())
     return Estimate(value, math.sqrt(measured + sampled) if n > 1 or found >= 1.0 else math.nan)
 
@@ -542,8 +627,8 @@ def _classes(
     """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
     included; none if no tree has a diameter. The first class begins at the minimum diameter, which makes it
     narrower unless that is a multiple of the width. Trees without a diameter are left out. The standard
-    errors contain the part of the plot out of sight and the errors of the diameters, by which trees belong to
-    another class.
+    errors contain the counting error, the part of the plot out of sight and the errors of the diameters, by
+    which trees belong to another class.
 
     Args:
         trees: Trees of the observed part from the minimum diameter.
@@ -562,11 +647,14 @@ def _classes(
     rows = []
     for k in range(first, int(of.max()) + 1):
         low, high = max(k * width, parameters.dbh_min), (k + 1) * width
-        basal, variance = _basal_areas(known.where(of == k), common)
+        inside = known.where(of == k)
+        basal, variance = _basal_areas(inside, common)
+        uncounted = inside.counting(parameters.count_error)
         unsure = _variance_of_number(every, low, high, common)
-        n_se = math.sqrt(rest * len(basal) + unsure)
+        n_se = math.sqrt(rest * len(basal) + unsure + float(uncounted.sum()) ** 2)
         middle = _basal_area(0.5 * (low + high))
-        g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance + unsure * middle**2)
+        variance += unsure * middle**2 + float(uncounted @ basal) ** 2
+        g_se = math.sqrt(rest * float(np.square(basal).sum()) + variance)
         if not len(basal) and n_se <= NEGLIGIBLE:  # nothing tells how many the map lacks
             n_se = g_se = math.nan
         rows.append(

@@ -40,6 +40,8 @@ _FIGURES_SHORT = {
     "dg_cm": "dg_cm",
     "mean_dbh_cm": "dm_cm",
     "dominant_dbh_cm": "ddom_cm",
+    "mean_height_m": "hm_m",
+    "lorey_height_m": "hl_m",
     "sdi": "sdi",
     "nearest_neighbour_m": "nn_m",
     "clark_evans": "ce",

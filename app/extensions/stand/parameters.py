@@ -19,6 +19,9 @@ class Stand(Stage):
     dbh_shared_sigma: float = number(0.005, "Shared DBH sigma", "m", 0.0, 0.05, 0.001)
     """Part of the standard deviation of a diameter that is one error of all trees of a map."""
 
+    count_error: float = number(0.06, "Counting error", "", 0.0, 0.5, 0.01)
+    """False and missed trees as a share of the stems: one error of all plots of a map."""
+
     class_width: float = number(0.04, "Class width", "m", 0.005, 0.5, 0.005)
     """Width of the diameter classes."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -45,7 +45,7 @@ from app.extensions.stand.plots import (
 from app.extensions.stand.volume import VolumeFormula
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
-from pipeline.io.result_files import csv_text, number_text
+from pipeline.io.result_files import CONFIRMED, csv_text, number_text
 from pipeline.seen_area import SeenArea
 from pipeline.types.records import Bool, Trees
 
@@ -138,7 +138,7 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise StemmapError(f"two plots are called {twice!r}", remedy="Give each plot its own name")
-    trees = counted_trees(run.trees, read_by_people(folder), parameters)
+    trees = counted_trees(run.trees, run.reviews, read_by_people(folder), parameters)
     chosen = list(plots) or [seen_plot(ALL, seen)]
     figures = figures_of(chosen, trees, seen, parameters)
     if not plots:
@@ -227,13 +227,14 @@ def people_words(counted: PeopleCount) -> str:
     return ", ".join(f"{count(n, what)} {how}" for n, (what, how) in zip(counted, words, strict=True) if n)
 
 
-def counted_trees(trees: Trees, people: ByPeople, parameters: Stand) -> PlotTrees:
+def counted_trees(trees: Trees, reviews: Mapping[int, str], people: ByPeople, parameters: Stand) -> PlotTrees:
     """Return the trees of stand figures: those of the map in their order, then those that people added. A
     diameter by tape takes the place of that of the map, see `counted_dbh`; an added tree has no other
     diameter and no height. They have volumes by the formula of the parameters, unless it is empty.
 
     Args:
         trees: Trees of the map without those that a person rejected.
+        reviews: Dict from the number of each tree to the state of its review, see `FinishedRun`.
         people: What people measured; diameters by tape of other trees are ignored.
         parameters: Parameters of the computation.
 
@@ -247,14 +248,17 @@ def counted_trees(trees: Trees, people: ByPeople, parameters: Stand) -> PlotTree
         """Return a column of the trees of the map with unknown values for the others."""
         return np.full(len(tape), np.nan) if column is None else np.concatenate([column, unknown])
 
+    confirmed = [reviews.get(number) == CONFIRMED for number in trees.number.tolist()]
     diameter, sigma, _ = counted_dbh(tape, with_added(trees.dbh), with_added(trees.dbh_sigma))
     counted = PlotTrees(
         np.concatenate([trees.position, people.added]),
         diameter,
         sigma,
         height=with_added(trees.height),
+        height_sigma=with_added(trees.height_sigma),
         by_tape=by_tape,
         added=np.arange(len(tape)) >= len(trees.number),
+        confirmed=np.array([*confirmed, *[False] * len(people.added)], np.bool_),
     )
     if not parameters.volume:
         return counted
@@ -445,8 +449,8 @@ def stand_summary(result: StandResult) -> list[str]:
         lines.append(f"detection: {_NO_DECREASE[detection.reason]}")
     corrected = "; corrected figures also detection" if math.isfinite(detection.sigma) else ""
     errors = "between plots" if len(observed) > 1 else f"of this area: diameters, occlusion{corrected}"
-    without = "false trees, and trees that neither the map nor people have, are not included"
-    lines.append(f"+- standard error {errors}; {without}")
+    false = f"{100.0 * result.parameters.count_error:g} % of the stems for false and missed trees"
+    lines.append(f"+- standard error {errors}; {false}, less for trees that people confirmed")
     return lines
 
 

@@ -61,7 +61,7 @@ function roles(topics) {
     if (!fitting.length) return [];
     const read = fitting.find(({ read_as: as }) => as === role);
     const list = el("select", { name: role, id: `inside-${role}` },
-      el("option", { value: "", text: read ? `${read.name} (found)` : "none found" }),
+      el("option", { value: "", text: read ? `${read.name} (found)` : "none is used" }),
       ...fitting.filter((topic) => topic !== read).map((topic) => el("option", { value: topic.name, text: [topic.name, figures(topic)].filter(Boolean).join(", ") })));
     return [el("label", { for: `inside-${role}`, text: title }), list];
   });
@@ -85,7 +85,7 @@ function table(topics) {
   return el("div", { class: "inside-topics" }, el("table", {}, el("tbody", {}, ...rows)));
 }
 
-const use = ({ read_as: as, why, why_not: whyNot }) => (as ? `used as ${as}${why ? ` (${why})` : ""}` : whyNot && `not used: ${whyNot}`);
+const use = ({ read_as: as, why, why_not: whyNot }) => (as ? `used as ${as}${why || whyNot ? ` (${why || whyNot})` : ""}` : whyNot && `not used: ${whyNot}`);
 
 export function startInside() {
   byId("source-inside").addEventListener("toggle", look);

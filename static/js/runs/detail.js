@@ -1,5 +1,6 @@
 // One run: figures, map, parameters and their changes.
 
+import { dayOf, lasts, logRows, logTable } from "../charts/log_table.js";
 import { get, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
@@ -107,8 +108,17 @@ function more(run, map) {
       ? table(["parameter", "value"], Object.entries(run.differences).map(([name, value]) => [name, String(value)]))
       : el("p", { class: "note", text: `None: all parameters are those of the preset ${run.preset}.` })),
     el("div", {}, el("h3", { text: "Changes of parameters" }), ...changes(run)),
+    ...(run.map.log ? [log(run.map.log, title)] : []),
     el("details", {}, el("summary", { text: `All ${Object.keys(run.parameters).length} parameters` }),
       table(["parameter", "value"], Object.entries(run.parameters).map(([name, value]) => [name, String(value)]))));
+}
+
+// A live run cannot be replayed with the times of this computer's clock, so its log is kept.
+function log({ events: every, start_s: start }, title) {
+  const events = every.filter((event) => !event.before), shown = events.filter(lasts);
+  return el("div", { id: "run-log" }, el("h3", { text: "Log" }),
+    shown.length ? el("div", { class: "scroll" }, logTable(shown, start, true)) : el("p", { class: "note", text: "No obstacle ahead, no silence, and the pose was good." }),
+    el("button", { class: "small", text: "All events as CSV", onclick: () => saveCsv(fileName(title, `log${dayOf(events, start, true)}.csv`), logRows(events, start, true)) }));
 }
 
 function changes({ revisions }) {

@@ -137,6 +137,25 @@ async def test_a_live_run_names_its_recordings(both: Running, tmp_path: Path) ->
         assert json.loads(archive.read("run.json"))["recordings"] == names
 
 
+async def test_a_live_run_keeps_its_log(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard, LIVE, scan=1)
+    live = Status("playing", scan_index=2, live=True)
+    await dashboard.receive(Report(live))
+    await dashboard.receive(Report(replace(live, state="waiting", detail="no data for 2 s", time_s=0.2)))
+    await show(dashboard, 8, 4)
+    await play(dashboard, "fake:", run=2)
+    await dashboard.run_recorder.close()
+    logs = {}
+    for row in await runs(client):
+        logs[row["uri"]] = (await client.get(f"/api/runs/{row['key']}")).json()["map"]["log"]
+    assert logs["fake:"] is None  # it can be replayed
+    silence = next(event for event in logs[LIVE]["events"] if event["kind"] == "silence")
+    assert (silence["text"], silence["for_s"]) == ("no data for 2 s", 0.6)
+    assert silence["noted_s"] > 1e9
+    assert logs[LIVE]["start_s"] == dashboard.start_ns / 1e9
+
+
 async def test_a_run_that_showed_nothing_leaves_no_record(both: Running) -> None:
     client, dashboard = both
     await dashboard.receive(opened())

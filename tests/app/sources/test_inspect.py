@@ -118,7 +118,14 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
         "/red/depth": ("", None, None),
     }
     assert "silent" in by_name(told)["/red/fix"]["why_not"]
+    read = {name: t["read_as"] for name, t in by_name(told).items()}
+    assert read == {"/red/points": "scan", "/red/fix": "gnss", "/red/image": "camera", "/red/depth": ""}
     assert (told["mount"], told["warnings"]) == (None, [])
+    named = inspection_process.heard("zenoh:tcp/127.0.0.1:7447?camera=none&gnss=/red/points")
+    assert {t["read_as"] for t in named["topics"]} == {""}
+    assert "/red/points is of the type" in named["warnings"][0]
+    bare = inspection_process.heard("zenoh:tcp/127.0.0.1:7447?camera=none&robot=red")
+    assert [t["name"] for t in bare["topics"] if t["read_as"]] == ["/red/points", "/red/fix"]
     monkeypatch.setattr(inspection_process, "link_for", lambda _address: lambda _, inbox: Announced(inbox))
     monkeypatch.setattr(inspection_process, "LISTEN_S", 0.1)
     assert "no topic was announced" in inspection_process.heard("velodyne:127.0.0.1:2368")["warnings"][0]

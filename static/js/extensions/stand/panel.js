@@ -26,6 +26,7 @@ const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],
 const HEADS = [["plot", ""], ["m²", "Area"], ["seen", "Observed part of the area"], ["trees", "Trees of at least the minimum diameter in the observed part"],
   ["stems/ha", "N/ha: stems per hectare"], ["basal area m²/ha", "G/ha: basal area per hectare"], ["Dq cm", "Dq: quadratic mean diameter"], ["mean DBH cm", "Arithmetic mean diameter"],
   ["dominant DBH cm", "Dominant diameter: quadratic mean of the 100 thickest trees per hectare"]];
+const HEIGHTS = [["mean height m", "hm: arithmetic mean height of the trees with a height"], ["Lorey height m", "hL: mean height weighted by basal area (Lorey)"]];
 const VOLUME = ["volume m³/ha", "Stem volume per hectare"];
 let figures = { all: null, plots: null, problem: "" };
 let shown = []; // edition and scan of the figures
@@ -129,10 +130,12 @@ function estimate([value, se] = [null, null]) {
   return el("td", {}, text, el("small", { text: ` ± ${error}` }));
 }
 
-function cells(of, withVolume) {
-  const names = ["n_ha", "g_ha", "dg_cm", "mean_dbh_cm", "dominant_dbh_cm", ...(withVolume ? ["v_ha"] : [])];
+function cells(of, { withHeight, withVolume }) {
+  const names = ["n_ha", "g_ha", "dg_cm", "mean_dbh_cm", "dominant_dbh_cm", ...(withHeight ? ["mean_height_m", "lorey_height_m"] : []), ...(withVolume ? ["v_ha"] : [])];
   const about = of.area_m2 === undefined ? ["", "", ""] : [figure(of.area_m2), percent(of.seen_m2 / of.area_m2), String(of.trees)];
-  return [...about.map((text) => el("td", { text })), ...names.map((name) => estimate(of[name]))];
+  const values = names.map((name) => estimate(of[name]));
+  if (withHeight && of.trees_with_height < of.trees) values[names.indexOf("mean_height_m")].append(el("small", { text: `, ${of.trees_with_height} of ${count(of.trees, "tree")}` }));
+  return [...about.map((text) => el("td", { text })), ...values];
 }
 
 // The row of a plot stays while its figures change, so that what a person types and selects in it stays too.
@@ -153,7 +156,7 @@ function lineOf(plot) {
   return line;
 }
 
-function showLine(line, plot, of, withVolume) {
+function showLine(line, plot, of, columns) {
   const { name, shape } = plot;
   line.plot = plot;
   if (line.text) setText(line.text, shape.kind === "circle" ? `${name} radius ${shape.radius} m` : name);
@@ -166,22 +169,24 @@ function showLine(line, plot, of, withVolume) {
   }
   line.gone.setAttribute("aria-label", `Delete plot ${name}`);
   for (const cell of [...line.node.cells].slice(1, -1)) cell.remove();
-  line.node.lastChild.before(...cells(of ?? {}, withVolume));
+  line.node.lastChild.before(...cells(of ?? {}, columns));
 }
 
 function fillTable() {
   const table = byId("plots-table"), body = table.tBodies[0];
   const found = figures.plots, withVolume = Boolean(formula());
-  const heads = [...HEADS, ...(withVolume ? [VOLUME] : [])];
+  const withHeight = [figures.all, found].some((each) => Object.values(each?.plots ?? {}).some((of) => of.trees_with_height));
+  const columns = { withHeight, withVolume };
+  const heads = [...HEADS, ...(withHeight ? HEIGHTS : []), ...(withVolume ? [VOLUME] : [])];
   table.tHead.replaceChildren(el("tr", {}, ...heads.map(([text, title]) => el("th", { scope: "col", text, title })), el("td")));
-  const sum = (text, of) => el("tr", { class: "sum" }, el("th", { scope: "row", text }), ...cells(of, withVolume), el("td"));
+  const sum = (text, of) => el("tr", { class: "sum" }, el("th", { scope: "row", text }), ...cells(of, columns), el("td"));
   for (const row of body.querySelectorAll(".sum")) row.remove();
   const known = new Set(plots().map(({ id }) => id));
   for (const [id, { node }] of lines) if (!known.has(id)) { node.remove(); lines.delete(id); } // first: a row that moves loses the focus
   plots().forEach((plot, place) => {
     if (!lines.has(plot.id)) lines.set(plot.id, lineOf(plot));
     const line = lines.get(plot.id);
-    showLine(line, plot, found?.plots[plot.name], withVolume);
+    showLine(line, plot, found?.plots[plot.name], columns);
     if (body.rows[place] !== line.node) body.insertBefore(line.node, body.rows[place] ?? null);
   });
   body.append(...(found && plots().length > 1 ? [sum("mean", found.mean)] : []),
@@ -202,7 +207,7 @@ function hint() {
   const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
   const trees = found === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${count(all, "tree")} are counted.`}${outOfSightText(unseen)}`;
   if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
-  return `Trees of the map at the shown time.${trees} ± is the standard error; false trees, and trees that neither the map nor people have, are not included. For the mean it is the variation between plots, at least the error of the plots.`;
+  return `Trees of the map at the shown time.${trees} ± is the standard error, with 6 % of the stems for false and missed trees, less for trees that people confirmed. For the mean it is the variation between plots, at least the error of the plots.`;
 }
 
 function outOfSightText(places) {

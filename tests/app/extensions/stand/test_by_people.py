@@ -123,7 +123,7 @@ def test_trees_of_the_figures_do_not_depend_on_the_order_of_what_people_state(ru
     place = np.arange(6.0).reshape(3, 2)
     added = np.array([np.nan if each is None else each for each in dbh[3:]])
     people = ByPeople(tape, place, added)
-    counted = counted_trees(trees, people, VOLUME)
+    counted = counted_trees(trees, {}, people, VOLUME)
     n = len(trees.number)
     assert counted.by_tape is not None
     assert counted.volume is not None
@@ -136,14 +136,14 @@ def test_trees_of_the_figures_do_not_depend_on_the_order_of_what_people_state(ru
     assert counted.by_tape.sum() == sum(each is not None for each in dbh)
     np.testing.assert_allclose(counted.volume, 10.0 * np.square(counted.dbh))
     rows = [k for k in order if k < 3]
-    other = counted_trees(trees, replace(people, added=place[rows], added_dbh=added[rows]), VOLUME)
+    other = counted_trees(trees, {}, replace(people, added=place[rows], added_dbh=added[rows]), VOLUME)
     np.testing.assert_array_equal(other.dbh[:n], counted.dbh[:n])
     np.testing.assert_array_equal(other.dbh[n:], counted.dbh[n:][rows])
 
 
 def test_without_statements_the_trees_are_those_of_the_map(run):
     trees = read_run(run).trees
-    counted = counted_trees(trees, ByPeople({}, np.zeros((0, 2)), np.zeros(0)), VOLUME)
+    counted = counted_trees(trees, {}, ByPeople({}, np.zeros((0, 2)), np.zeros(0)), VOLUME)
     for name in ("position", "dbh", "dbh_sigma"):
         np.testing.assert_array_equal(getattr(counted, name), getattr(trees, name))
     assert counted.of_map.all()

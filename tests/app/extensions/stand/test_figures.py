@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from app.extensions.stand.figures import PlotTrees, combined, compared_with_gaps, stand_figures
 from app.extensions.stand.parameters import Stand
 
-INDEPENDENT = Stand(dbh_shared_sigma=0.0)
+EXACT_COUNT = Stand(count_error=0.0)
+INDEPENDENT = Stand(dbh_shared_sigma=0.0, count_error=0.0)
 
 
 def trees_of(dbh, sigma=0.0, position=None):
@@ -36,7 +37,7 @@ def figures(
         seen=area if seen is None else seen,
         perimeter=perimeter,
         detection=detection,
-        parameters=limits or Stand(),
+        parameters=limits or EXACT_COUNT,
     )
 
 
@@ -84,12 +85,14 @@ def test_an_error_that_all_diameters_share_does_not_shrink_with_their_number():
             "volume_shared": 20.0 * d * shared,
         }
         trees = replace(trees_of(d, math.hypot(own, shared)), **volume)
-        v = figures(trees, limits=Stand(dbh_shared_sigma=shared)).values
+        v = figures(trees, limits=Stand(count_error=0.0, dbh_shared_sigma=shared)).values
         found.append([v[name].value for name in names])
         told.append([v[name].se for name in names])
     ratio = np.std(found, axis=0) / np.sqrt(np.mean(np.square(told), axis=0))
     np.testing.assert_allclose(ratio, 1.0, atol=0.12)
-    many = figures(trees_of([0.3] * 400, 0.01), limits=Stand(dbh_shared_sigma=0.006)).values["mean_dbh_cm"]
+    many = figures(trees_of([0.3] * 400, 0.01), limits=Stand(count_error=0.0, dbh_shared_sigma=0.006)).values[
+        "mean_dbh_cm"
+    ]
     assert many.se == pytest.approx(math.sqrt(0.6**2 + (1.0 - 0.6**2) / 400))
 
 
@@ -99,7 +102,7 @@ def test_a_shared_error_moves_all_trees_across_the_minimum_diameter_together():
     found, told = [], []
     for _ in range(400):
         d = true + random.normal(0.0, shared) + random.normal(0.0, own, 300)
-        limits = Stand(dbh_shared_sigma=shared, dbh_min=0.1)
+        limits = Stand(count_error=0.0, dbh_shared_sigma=shared, dbh_min=0.1)
         n = figures(trees_of(d, math.hypot(own, shared)), limits=limits).values["n_ha"]
         found.append(n.value)
         told.append(n.se)
@@ -114,7 +117,7 @@ def test_the_number_of_a_class_is_wrong_by_about_its_standard_error(shared):
     limit; for evenly distributed diameters this is a factor of sqrt(sqrt(2)) = 1.19 at a single limit."""
     random = np.random.default_rng(6)
     wrong, told = [], []
-    limits = Stand(dbh_min=0.08, dbh_shared_sigma=shared)
+    limits = Stand(count_error=0.0, dbh_min=0.08, dbh_shared_sigma=shared)
     for _ in range(150):
         true = random.uniform(0.02, 0.62, 150)
         sigma = np.hypot(random.uniform(0.013, 0.027, 150), shared)
@@ -296,13 +299,52 @@ def test_an_added_tree_counts_once_and_without_correction(dbh, more, share, p):
 def test_diameters_by_tape_share_no_error():
     mapped = trees_of([0.3] * 40, 0.005)
     taped = replace(mapped, by_tape=np.ones(40, np.bool_))
-    limits = Stand(dbh_shared_sigma=0.005)
+    limits = Stand(count_error=0.0, dbh_shared_sigma=0.005)
     for name in ("mean_dbh_cm", "dg_cm", "g_ha", "sdi"):
         before, after = (figures(trees, limits=limits).values[name] for trees in (mapped, taped))
         assert after.value == before.value
         assert after.se == pytest.approx(before.se / math.sqrt(40))
     near = [figures(replace(trees, dbh=np.full(40, 0.07)), limits=limits) for trees in (mapped, taped)]
     assert near[1].values["n_ha"].se < 0.5 * near[0].values["n_ha"].se
+
+
+def test_a_plot_in_full_view_has_the_counting_error_in_each_figure_of_stems():
+    wrong, exact = (
+        figures(trees_of([0.1, 0.3] * 20), detection=(1.0, math.nan), limits=limits)
+        for limits in (Stand(count_error=0.06), EXACT_COUNT)
+    )
+    for name in ("n_ha", "g_ha", "n_ha_corrected", "g_ha_corrected", "sdi"):
+        assert wrong.values[name].se == pytest.approx(0.06 * wrong.values[name].value), name
+    for name in ("dg_cm", "mean_dbh_cm", "dominant_dbh_cm", "nearest_neighbour_m", "clark_evans"):
+        np.testing.assert_equal(wrong.values[name], exact.values[name])
+    assert [c.n_ha.se for c in wrong.classes if c.trees] == pytest.approx([0.06 * 200.0] * 2)
+    with_view = figures(trees_of([0.2] * 40), seen=900.0, limits=Stand(count_error=0.06)).values["n_ha"]
+    without = figures(trees_of([0.2] * 40), seen=900.0).values["n_ha"]
+    assert with_view.se == pytest.approx(math.hypot(without.se, 0.06 * with_view.value))
+
+
+def test_trees_that_people_confirmed_measured_or_added_are_not_false():
+    trees, limits = trees_of([0.2] * 40), Stand(count_error=0.06)
+    half = np.arange(40) < 20
+    for stated in ("confirmed", "by_tape", "added"):
+        f = figures(replace(trees, **{stated: half}), limits=limits)
+        assert f.values["n_ha"].se == pytest.approx(10.0 * (20 * 0.06 + 20 * 0.01)), stated
+    every = figures(replace(trees, confirmed=np.ones(40, np.bool_)), limits=limits)
+    assert every.values["n_ha"].se == pytest.approx(10.0 * 40 * 0.01)
+
+
+def test_the_counting_error_of_all_plots_does_not_decrease_with_their_number():
+    """Maps drawn with a share of false trees that all of their plots have."""
+    random = np.random.default_rng(3)
+    errors, told = [], []
+    for _ in range(200):
+        false = 1.0 + random.normal(0.0, 0.06)
+        counts = np.round(false * 200.0 * random.normal(1.0, 0.1, 9)).astype(int)
+        plots = {str(k): figures(trees_of([0.2] * n), limits=Stand()) for k, n in enumerate(counts)}
+        mean = combined(plots)["n_ha"]
+        errors.append(mean.value - 2000.0)
+        told.append(mean.se)
+    assert np.std(errors) == pytest.approx(math.sqrt(np.mean(np.square(told))), rel=0.12)
 
 
 def test_thin_trees_do_not_count_and_those_without_a_diameter_have_the_mean():
@@ -435,6 +477,52 @@ def test_the_error_of_volumes_is_that_of_stands_of_which_some_heights_are_seen()
         told.append(v.se)
     assert abs(np.mean(errors)) < 3 * np.std(errors) / 20
     assert np.std(errors) == pytest.approx(math.sqrt(np.mean(np.square(told))), rel=0.12)
+
+
+def with_heights(trees, height, sigma):
+    return replace(trees, height=np.array(height), height_sigma=np.where(np.isfinite(height), sigma, np.nan))
+
+
+def test_mean_heights_are_those_of_the_textbook():
+    d, height = [0.1, 0.2, 0.3] * 4, [10.0, 20.0, 25.0] * 4
+    f = figures(with_heights(trees_of(d), height, 0.5), limits=INDEPENDENT)
+    assert f.values["mean_height_m"] == pytest.approx((55.0 / 3, 0.5 / math.sqrt(12)))
+    lorey = (0.01 * 10.0 + 0.04 * 20.0 + 0.09 * 25.0) / 0.14
+    weight = np.array([0.01, 0.04, 0.09] * 4) / 0.56
+    assert f.values["lorey_height_m"] == pytest.approx((lorey, 0.5 * math.sqrt(np.square(weight).sum())))
+    assert (f.with_height, f.warnings) == (12, ())
+    unknown = figures(trees_of(d))
+    assert all(math.isnan(unknown.values[name].value) for name in ("mean_height_m", "lorey_height_m"))
+    assert unknown.warnings == ()
+    assert combined({"a": f, "b": unknown})["mean_height_m"].value == pytest.approx(55.0 / 3)
+
+
+def test_heights_of_a_part_of_the_trees_are_a_sample_of_all():
+    """Stands of which 42 of 50 heights are known, with errors of heights and diameters."""
+    random = np.random.default_rng(8)
+    names, errors, told = ("mean_height_m", "lorey_height_m"), [], []
+    for _ in range(200):
+        d = random.lognormal(math.log(0.3), 0.3, 50)
+        height = 30.0 * (1.0 - np.exp(-5.0 * d)) + random.normal(0.0, 2.0, 50)
+        seen = np.where(random.permutation(50) < 42, height + random.normal(0.0, 0.8, 50), np.nan)
+        measured = with_heights(trees_of(d + random.normal(0.0, 0.02, 50), 0.02), seen, 0.8)
+        v = figures(measured, limits=INDEPENDENT).values
+        whole = figures(with_heights(trees_of(d), height, 0.0), limits=INDEPENDENT).values
+        errors.append([v[name].value - whole[name].value for name in names])
+        told.append([v[name].se for name in names])
+    ratio = np.std(errors, axis=0) / np.sqrt(np.square(told).mean(axis=0))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+
+
+def test_few_heights_are_a_warning_with_their_number_and_have_no_error():
+    for missing, is_known in ((10, True), (11, False)):
+        height = np.where(np.arange(50) < missing, np.nan, 20.0)
+        f = figures(with_heights(trees_of([0.3] * 50), height, 0.5))
+        (text,) = f.warnings
+        assert f"mean heights are those of {50 - missing} of 50 trees" in text
+        assert ("errors are not known" in text) != is_known
+        assert f.values["lorey_height_m"].value == pytest.approx(20.0)
+        assert math.isfinite(f.values["lorey_height_m"].se) == is_known
 
 
 def test_plain_figures_of_several_plots_refer_to_their_whole_area():

@@ -197,7 +197,9 @@ def test_figures_refer_to_the_observed_part_of_a_plot():
     assert half.values["n_ha_plain"].value == pytest.approx(1e4)
     assert half.values["n_ha"].se > 0.0
     assert figures["in"].seen == figures["in"].area == pytest.approx(100)
-    assert math.isnan(figures["in"].values["n_ha"].se)  # detection does not decrease, and may be below 1
+    assert figures["in"].values["n_ha"] == pytest.approx((1e4, 600.0))  # the counting error
+    exact = figures_of(plots, trees, seen, Stand(count_error=0.0))["in"]
+    assert math.isnan(exact.values["n_ha"].se)  # detection does not decrease, and may be below 1
     assert (figures["out"].seen, figures["out"].trees) == (0.0, 0)
     assert "no part of the plot was observed" in figures["out"].warnings[0]
 

@@ -177,7 +177,10 @@ def test_parameters_have_titles_and_units(tmp_path, capsys):
     shown = " ".join(Page(page_of(capsys, folder, tmp_path / "d.html", [*words, "--language", "de"])).texts)
     assert "dbh_min" not in shown
     assert "Kluppschwelle: 7,5 cm" in shown
-    assert "Kluppschwelle: 0,075 m; Gemeinsamer BHD-Fehler: 0,005 m; Klassenbreite: 0,04 m; " in shown
+    assert (
+        "Kluppschwelle: 0,075 m; Gemeinsamer BHD-Fehler: 0,005 m; Zählfehler: 0,06; Klassenbreite: 0,04 m; "
+        in shown
+    )
     assert "Stärkste Bäume: 100 1/ha" in shown
     assert "Korrektur: halbnormal; Volumenformel: 0.001*dbh_cm^2" in shown
     spec = next(spec for spec in field_specs() if spec.name == "clustering.eps")
@@ -241,10 +244,28 @@ def test_a_small_error_is_not_rounded_to_0_and_one_that_is_not_known_is_explaine
     errors = {0.0: 0, 3.0: 0, 0.3: 1, 0.04: 2, 1e-9: 0, math.nan: 0}
     assert {se: _digits(Estimate(1365.6, se)) for se in errors} == errors
     assert _digits(Estimate(5.0, 0.2), 0) == 1
-    text = page_of(capsys, run, tmp_path / "r.html")  # at 20 cm of 1 cm, 7 cm is far
-    assert catalogue_of("en")["unknown_error"] in text
-    fewer = page_of(capsys, run, tmp_path / "f.html", ["--dbh-min", "0.2"])
-    assert catalogue_of("en")["unknown_error"] not in fewer
+    nothing = page_of(capsys, run, tmp_path / "r.html", ["--dbh-min", "0.9"])
+    assert catalogue_of("en")["unknown_error"] in nothing
+    assert catalogue_of("en")["unknown_error"] not in page_of(capsys, run, tmp_path / "f.html")
+
+
+def test_a_report_has_mean_heights_and_their_number_of_trees(run, tmp_path, capsys):
+    assert "Loreysche" not in page_of(capsys, run, tmp_path / "none.html", ["--language", "de"])
+    cloud = grid_run(tmp_path / "run")
+    rows = [line.split(",") for line in (cloud / "trees.csv").read_text().splitlines()]
+    columns = [rows[0].index(name) for name in ("height_m", "sigma_height_m")]
+    for row in rows[1:91]:
+        row[columns[0]], row[columns[1]] = "21.40", "0.30"
+    (cloud / "trees.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
+    words = ["--rectangle", "10,10,10,10", "--language", "de"]
+    text = page_of(capsys, cloud, tmp_path / "r.html", words)
+    assert "Bäume mit Höhe: 90" in text
+    assert "die mittleren Höhen sind die von 90 von 100 Bäumen" in text
+    assert re.search(r"<td>Mittlere Höhe hm</td><td>21,4</td><td>0,03</td>", text.replace("21,40", "21,4"))
+    head, row = re.findall(r"<tr>(<t[hd]>(?:Fläche|1)<.*)</tr>", text)[:2]
+    titles, cells = (re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in (head, row))
+    assert len(titles) == len(cells)
+    assert cells[titles.index("hL m")].startswith("21,4")
 
 
 def test_plots_have_their_dominant_diameter(tmp_path, capsys):

@@ -184,16 +184,27 @@ def test_a_plot_that_was_not_observed_is_left_out_of_the_mean_and_named(run, tmp
 
 
 def test_what_is_not_known_of_detection_is_said_and_no_error_is_0(run, tmp_path, capsys):
-    many = stemmap(capsys, "stand", run).out
+    many = stemmap(capsys, "stand", run, "--count-error", "0").out
     assert "Stems per hectare: 2,500 1/ha, standard error not known" in many
     assert "detection: does not decrease with distance within reach" in many
-    assert "false trees, and trees that neither the map nor people have, are not included" in many
     position = np.random.default_rng(2).uniform(1, 19, (12, 2))
-    few = stemmap(capsys, "stand", write_run(tmp_path / "few", position, np.full(12, 0.2)), "--out", tmp_path)
+    few_trees = write_run(tmp_path / "few", position, np.full(12, 0.2))
+    few = stemmap(capsys, "stand", few_trees, "--count-error", "0", "--out", tmp_path)
     assert "detection: not estimated from fewer than 20 trees, every tree in view counts as found" in few.out
     record = json.loads((tmp_path / "stand.json").read_text())
     assert record["detection_not_estimated"] == "few_trees"
     assert record["plots"]["all"]["n_ha"][1] is None
+
+
+def test_stems_of_a_plot_in_full_view_have_the_error_of_false_and_missed_trees(run, tmp_path, capsys):
+    shown = stemmap(capsys, "stand", run).out
+    assert "Stems per hectare: 2,500 +- 150 1/ha" in shown
+    assert "6 % of the stems for false and missed trees, less for trees that people confirmed" in shown
+    lines = (run / "trees.csv").read_text().splitlines()
+    (run / "trees.csv").write_text(
+        "\n".join([lines[0], *(each.replace("open", "confirmed") for each in lines[1:])])
+    )
+    assert "Stems per hectare: 2,500 +- 25.0 1/ha" in stemmap(capsys, "stand", run).out
 
 
 def test_two_plots_of_one_name_are_refused(run, tmp_path, capsys):
