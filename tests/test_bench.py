@@ -239,6 +239,7 @@ def test_the_peers_trees_merge_within_the_radius() -> None:
     assert [tree.hits for tree in trees.trees] == [6, 5]
 
 
+@pytest.mark.slow
 def test_both_sides_map_the_same_scans() -> None:
     time_table, map_table = compare(Comparison("sim:paper", 10, 8, "paper", {}, "paper"), 3600.0)
     assert [row[0] for row in time_table.rows][-2:] == ["total", "peak memory MiB"]

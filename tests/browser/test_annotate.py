@@ -344,7 +344,6 @@ PRESSES = """async ([key, number, wait, held]) => {
 }"""
 
 
-@pytest.mark.slow
 def test_a_held_key_and_keys_faster_than_a_look_answer_for_no_unseen_tree(person: Dashboard):
     page = person.page
     page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")

@@ -123,6 +123,7 @@ def test_the_columns_name_the_directions_of_the_axes(dashboard: Dashboard):
         assert words in (button.get_attribute("title") or "")
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("choice", ["distance", "error", "time", "n_eff", "sigma", "quantities"])
 @pytest.mark.usefixtures("calm")
 def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
@@ -136,6 +137,7 @@ def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
     expect(drawn.first).to_be_attached()
 
 
+@pytest.mark.slow
 def test_a_source_that_cannot_be_opened_leaves_the_run_and_says_why(dashboard: Dashboard, tmp_path: Path):
     page = dashboard.page
     dashboard.tab("Trees")
@@ -188,6 +190,7 @@ NUMBERS = """() => import('/static/js/map/draw.js').then(({ drawNumbers }) => {
 })"""
 
 
+@pytest.mark.slow
 def test_numbers_on_the_map_overlap_neither_each_other_nor_a_symbol(dashboard: Dashboard):
     named, covered = dashboard.page.evaluate(NUMBERS)
     assert covered == []

@@ -88,7 +88,6 @@ SIZES = {
 }
 
 
-@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("size", SIZES)
 def test_nothing_overflows_the_page(chromium: Browser, server: Server, size: tuple[int, int]):
     with opened(chromium, server.link, *size, scene=size[0] == 390) as dashboard:

@@ -233,6 +233,7 @@ print(numba.config.CPU_NAME, repr(numba.config.CPU_FEATURES))
 V3 = ["avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"]
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize(
     ("machine", "chosen", "target"),
     [

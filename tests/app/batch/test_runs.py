@@ -367,6 +367,7 @@ async def test_from_afar_a_run_of_a_hidden_file_is_not_opened() -> None:
         assert (await client.post(f"/api/runs/{row['key']}/replay")).status_code == 403
 
 
+@pytest.mark.slow
 async def test_a_finished_folder_in_the_data_folder_is_listed_and_read(tmp_path: Path) -> None:
     from app.cli import main
 

@@ -100,7 +100,7 @@ def test_the_files_of_a_map_have_the_same_bytes_from_each_container(
         assert (maps[one] / name).read_bytes() == (maps[other] / name).read_bytes(), name
 
 
-@pytest.mark.slow_after(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("capture", ["pcap", "dual pcap"])
 def test_a_capture_gives_the_trees_of_the_clouds_of_the_driver(capture: str, maps: dict[str, Path]):
     """Packets round ranges to 2 mm, and lasers fire microseconds apart."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+from functools import cache
 from pathlib import Path
 
 import httpx
@@ -42,6 +43,17 @@ FOLDERS = ("app", "pipeline", "static", "tests/app", "tests/pipeline", "tests/br
 SUFFIXES = {".py", ".js", ".html", ".css", ".j2", ".toml"}
 
 
+@cache
+def files() -> list[tuple[Path, list[str]]]:
+    """The files in which an extension may be named, with their lines."""
+    paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*"))]
+    return [
+        (path, path.read_text(encoding="utf-8").splitlines())
+        for path in paths
+        if path.suffix in SUFFIXES and "vendor" not in path.parts
+    ]
+
+
 def test_each_extension_of_the_package_has_its_words():
     ours = [each.name for each in all_extensions() if each.package.startswith("stemmap ")]
     assert ours == NAMES
@@ -52,14 +64,14 @@ def test_each_extension_of_the_package_has_its_words():
 def test_only_its_own_files_name_an_extension(name):
     word = re.compile(WORDS[name], re.IGNORECASE)
     offenders = []
-    for path in (path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*"))):
+    for path, lines in files():
         place = path.relative_to(ROOT).as_posix()
         is_own = f"extensions/{name}/" in place or f"extensions/survey_{name}" in place
         is_own |= place.startswith(f"tests/browser/extensions/test_{name}")
         is_own |= path == Path(__file__) or place == "tests/browser/extensions/test_loading.py"
-        if path.suffix not in SUFFIXES or is_own or "vendor" in path.parts:
+        if is_own:
             continue
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+        for number, line in enumerate(lines, 1):
             if word.search(line):
                 offenders.append(f"{place}:{number} {line.strip()[:80]}")
     assert offenders == []

@@ -88,6 +88,7 @@ def test_a_lidar_that_is_unplugged_and_comes_back_goes_on_in_the_same_map(sendin
         assert on.shown == sorted(set(on.shown))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no limits of file sizes")
 def test_a_file_that_may_not_grow_ends_the_recording_alone(drive: Path, tmp_path: Path):
     out = tmp_path / "live.mcap"

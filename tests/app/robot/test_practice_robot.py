@@ -23,7 +23,7 @@ def stamps(records: list[Record]) -> list[list[int]]:
     return [[r.stamp_ns for r in records if isinstance(r, kind)] for kind in (Scan, Odometry)]
 
 
-@pytest.mark.slow_after(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("run", ["a recording", "sim:paper?duration=1"])
 def test_a_run_is_sent_as_soon_as_somebody_listens(drive: Path, run: str):
     port, scans = free_port(), SCANS if run == "a recording" else 10

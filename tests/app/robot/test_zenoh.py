@@ -81,6 +81,7 @@ def test_a_router_that_is_not_there_is_named_and_tried_again():
         assert not source.listen()
 
 
+@pytest.mark.slow
 def test_others_hear_the_pose_and_the_trees(router: int, robots: Callable[[str], Robot]):
     robot = robots("red")
     near = Clearance(Zone.SLOW, 1.75, 0.0, 2.15, 0.0, within=3.0)
@@ -116,6 +117,7 @@ def test_all_robots_at_once_and_unknown_options_are_refused():
             open_live(f"zenoh:tcp/127.0.0.1:9?{options}")
 
 
+@pytest.mark.slow
 def test_routers_that_are_connected_pass_a_robot_on(router: int, robots: Callable[[str], Robot]):
     far = free_port()
     other = Child("-m", "tests.app.robot.router", str(far), str(router))

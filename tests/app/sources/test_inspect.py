@@ -53,6 +53,7 @@ def by_name(told: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {topic["name"]: topic for topic in told["topics"]}
 
 
+@pytest.mark.slow
 async def test_a_recording_tells_its_topics_and_where_the_lidar_stands(both: Running, run: Path) -> None:
     client, _ = both
     told = (await client.post("/api/inside", json={"uri": str(run)})).json()
@@ -131,6 +132,7 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
     assert "no topic was announced" in inspection_process.heard("velodyne:127.0.0.1:2368")["warnings"][0]
 
 
+@pytest.mark.slow
 async def test_a_source_is_checked_up_to_its_first_scan(tmp_path: Path, run: Path) -> None:
     await opening.check_source(SourceRequest(str(run), mount=(0.0, 0.0, 2.0, 0.0, 0.0, 0.0)))
     notes, cut = tmp_path / "notes.txt", tmp_path / "cut.mcap"

@@ -219,6 +219,7 @@ VIEWER = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
 VIEWERS_COOKIE = {"Cookie": f"stemmap_{PORT}={session_value(viewer_token(TOKEN), PORT, ENDS)}"}
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("who", [VIEWER, VIEWERS_COOKIE])
 async def test_who_may_look_changes_nothing(client: httpx.AsyncClient, who: dict[str, str]) -> None:
     for method, path in ROUTES:
@@ -247,6 +248,7 @@ async def test_the_viewers_link_becomes_a_cookie_that_looks(client: httpx.AsyncC
     assert (await client.get("/api/access", headers=both)).json()["role"] == "owner"
 
 
+@pytest.mark.slow
 async def test_who_may_look_hears_and_selects_nothing() -> None:
     async with served() as (host, dashboard):
         looks = connect(f"ws://{host}/api/live", additional_headers=VIEWER, proxy=None)

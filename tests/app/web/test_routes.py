@@ -450,6 +450,7 @@ async def test_layers_for_other_programs_follow_the_run(both: Running) -> None:
     assert len(line["geometry"]["coordinates"]) > 1
 
 
+@pytest.mark.slow
 async def test_a_layer_is_made_again_only_after_a_change(
     both: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:

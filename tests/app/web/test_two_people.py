@@ -67,6 +67,7 @@ async def selection(page: ClientConnection, **wanted: Any) -> dict[str, Any]:
                 return message
 
 
+@pytest.mark.slow
 async def test_a_selection_names_its_page_and_what_the_open_pages_have_selected() -> None:
     ann, bob = "a" * 32, "b" * 32
     async with (

@@ -322,6 +322,7 @@ def test_a_folder_of_which_a_file_is_being_written_is_not_removed(recordings: Pa
     assert kept(recordings) == [active.name]
 
 
+@pytest.mark.slow
 async def test_a_real_file_is_recognised_by_its_contents(tmp_path: Path) -> None:
     from app.cli import main
 

@@ -153,6 +153,7 @@ def test_a_picture_travels_between_the_processes(source: RosSource):
     np.testing.assert_array_equal(back.camera.camera.K, CAMERA.K)
 
 
+@pytest.mark.slow
 def test_the_best_picture_of_a_tree_is_one_that_shows_it(source: RosSource):
     session = new_session()
     session.open(Open(source.description.uri, "auto", 3))

@@ -231,6 +231,7 @@ def pictures(said: list[FromWorker]) -> dict[int, float]:
     return {m.frame.index: m.frame.estimate.T_map_base.x for m in said if isinstance(m, Shown)}
 
 
+@pytest.mark.slow
 def test_a_sought_scan_is_shown() -> None:
     said = driven(FakeSource(80), Open("fake:"), Seek(5.0), Advance(-3), Pause())
     assert shown(said)[-1] == 47
@@ -238,6 +239,7 @@ def test_a_sought_scan_is_shown() -> None:
     assert last_status(said).state == "paused"
 
 
+@pytest.mark.slow
 def test_on_a_long_way_the_status_says_where_it_goes() -> None:
     said = driven(FakeSource(900), Open("fake:"), Seek(85.0))
     on_the_way = [m.status for m in said if isinstance(m, Report) and m.status.detail.startswith("Going")]

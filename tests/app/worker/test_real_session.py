@@ -63,6 +63,7 @@ def test_the_real_mapper_comes_back_to_the_same_bytes(session: Session) -> None:
     np.testing.assert_array_equal(session.shown.path.x, path.x)
 
 
+@pytest.mark.slow
 def test_the_observed_area_is_that_of_the_command(session: Session, tmp_path: FilePath) -> None:
     """Also after steps back and forth."""
     for index in (40, 10, 69):
@@ -152,6 +153,7 @@ def looked_at(session: Session, index: int) -> tuple[Frame, Path, Float]:
     return shown, session.shown.path, session.shown.confirmed_s
 
 
+@pytest.mark.slow
 def test_a_mapped_scan_is_shown_again_without_mapping(session: Session) -> None:
     results = mapped(session, 65)
     for index in (63, 62, 0, 31, 33, 50, 64 - 1):
@@ -170,6 +172,7 @@ def test_a_mapped_scan_is_shown_again_without_mapping(session: Session) -> None:
     assert_equal(following, results[62][0])
 
 
+@pytest.mark.slow
 def test_after_a_change_of_the_whole_run_its_scans_are_shown_with_the_new_map(session: Session) -> None:
     mapped(session, 60)
     other = Parameters().replace({"clustering.eps": 0.4})

@@ -151,6 +151,7 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
             assert maps[id(wanted)] == (content_of(other.shown.frame), content_of(other.shown.path), since)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("parameters", [FEWER, WIDER])
 def test_undo_and_redo_of_the_last_change_map_only_the_current_scan_again(session, parameters, monkeypatch):
     mapped: list[int] = []
@@ -492,6 +493,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
     assert [time_s for _, time_s in back.confirmed] == sorted(marked.values())
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("begun_before", [False, True])
 def test_a_change_on_the_way_to_another_scan_acts_on_the_whole_run_there(session, begun_before):
     if begun_before:

@@ -266,6 +266,7 @@ async def test_a_refused_source_is_no_longer_being_opened(
     assert worker._opening == ""
 
 
+@pytest.mark.slow
 async def test_another_source_replaces_one_that_does_not_finish_opening(
     both: tuple[WorkerProcess, Said], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -279,6 +280,7 @@ async def test_another_source_replaces_one_that_does_not_finish_opening(
     assert worker.restarts == 0
 
 
+@pytest.mark.slow
 @in_one_loop
 async def test_a_command_while_the_worker_restarts_is_refused_and_not_lost(
     shared: tuple[WorkerProcess, Said],
@@ -328,6 +330,7 @@ async def test_a_run_that_stops_answering_is_reported_and_replaced() -> None:
         await worker.close()
 
 
+@pytest.mark.slow
 async def test_the_time_without_an_answer_counts_from_the_command_of_an_idle_run() -> None:
     said = Said()
     worker = WorkerProcess(FAKE, silence_limit_s=9.0)  # a sixth of it is reported
@@ -345,6 +348,7 @@ async def test_the_time_without_an_answer_counts_from_the_command_of_an_idle_run
         await worker.close()
 
 
+@pytest.mark.slow
 async def test_a_worker_that_gets_no_processor_is_reported_and_not_replaced(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -389,6 +393,7 @@ async def test_a_command_that_is_not_answered_while_paused_replaces_the_worker()
         await worker.close()
 
 
+@pytest.mark.slow
 async def test_a_run_that_is_paused_or_plays_slowly_is_not_replaced() -> None:
     said = Said()
     worker = WorkerProcess(FAKE, silence_limit_s=2.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 from playwright.sync_api import Route, expect
 
 from tests.browser.dashboard import Dashboard
@@ -10,7 +9,6 @@ from tests.browser.dashboard import Dashboard
 MODULES = "**/js/extensions/*/main.js"
 
 
-@pytest.mark.slow
 def test_a_click_right_after_loading_counts_though_a_module_is_slow(dashboard: Dashboard):
     page = dashboard.page
 

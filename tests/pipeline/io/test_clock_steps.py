@@ -18,6 +18,7 @@ HOUR_NS = 3_600_000_000_000
 SCANS, CHANGE = 12, 6
 
 
+@pytest.mark.slow_after(9)
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS, -START_NS + 10**9], ids=["+1h", "-1h", "1970"])
 @pytest.mark.parametrize("recorder_too", [True, False])
@@ -140,7 +141,7 @@ def check_order(source: Source, *, gap_ns: int = 0) -> None:
         assert (np.diff(stamps) > 0).all()
 
 
-@pytest.mark.slow_after(12)
+@pytest.mark.slow_after(5)
 @pytest.mark.parametrize("which", ["/points", "/odom", "stamps", "all"])
 @pytest.mark.parametrize("step_s", STEPS_S)
 def test_any_step_of_any_clock_keeps_the_order_of_the_file(
@@ -151,6 +152,7 @@ def test_any_step_of_any_clock_keeps_the_order_of_the_file(
     check_order(source, gap_ns=round(step_s * 1e9) if which == "all" and step_s > 0 else 0)
 
 
+@pytest.mark.slow_after(4)
 @pytest.mark.parametrize("kind", ["bag", "db3"])
 @pytest.mark.parametrize("which", ["/points", "/odom", "stamps", "all"])
 def test_a_clock_that_is_set_several_times(kind: str, which: str, tmp_path: Path, opened: Opened):
@@ -177,7 +179,7 @@ def test_two_lidars_on_one_topic_with_other_delays_are_no_steps(tmp_path: Path, 
     assert not source.losses
 
 
-@pytest.mark.slow_after(2)
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("begun_s", [12.3, 946_684_800.0, START_NS * 1e-9 + 37.0, START_NS * 1e-9 - 3.0])
 @pytest.mark.parametrize("other", ["/points", "/odom"])
 def test_a_topic_by_another_clock_is_aligned_without_its_delay(

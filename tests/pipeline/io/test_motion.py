@@ -59,12 +59,14 @@ def path_error(source: Source, choice: str) -> tuple[float, str]:
     return float(np.hypot(there[:, 0] - x, there[:, 1] - y).max()), chosen.words
 
 
+@pytest.mark.slow
 def test_scans_laid_over_one_another_tell_the_way():
     error, words = path_error(without_wheels(), "auto")
     assert error < 0.5
     assert words == "registration of the scans, because the source has no odometry"
 
 
+@pytest.mark.slow
 def test_wheels_say_where_the_search_begins():
     error, words = path_error(open_source(URI), "lidar")
     assert error < 0.3

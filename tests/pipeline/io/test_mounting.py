@@ -29,6 +29,7 @@ def mounted(roll: float, pitch: float, height: float = 0.8) -> Pose3:
     return Pose3.from_euler(np.array([0.0, 0.0, height]), np.radians(roll), np.radians(pitch), 0.0)
 
 
+@pytest.mark.slow_after(5)
 @pytest.mark.parametrize("scenario", ["sim:stand?duration=2", "sim:slope?duration=2", "sim:dense?duration=2"])
 @pytest.mark.parametrize(("roll", "pitch"), [(180, 0), (0, 45), (90, 0), (-90, 0)])
 @pytest.mark.parametrize("lidar", [SpinningLidar(), SolidStateLidar()], ids=["spinning", "solid"])
@@ -42,6 +43,7 @@ def test_a_tilted_lidar_is_levelled(scenario: str, roll: float, pitch: float, li
     assert np.degrees(np.arccos(min(1.0, float((found.R @ true.R.T)[0, 0])))) < 8.0
 
 
+@pytest.mark.slow_after(9)
 @pytest.mark.parametrize("scenario", ["sim:stand?duration=2", "sim:slope?duration=2", "sim:dense?duration=2"])
 @pytest.mark.parametrize("height", [0.4, 0.8, 2.2])
 @pytest.mark.parametrize("lidar", [SpinningLidar(), SolidStateLidar()], ids=["spinning", "solid"])

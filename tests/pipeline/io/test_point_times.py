@@ -155,6 +155,7 @@ def test_beams_without_a_return_do_not_count():
     np.testing.assert_allclose(offset_ns, SWEEP[seen], atol=500)
 
 
+@pytest.mark.slow_after(7)
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 @pytest.mark.parametrize("name", ["timestamp", "time_stamp", "timeOffset", "ts", "offset_time"])
 def test_a_recording_says_by_which_clock_its_points_are(kind: str, name: str, tmp_path: Path, opened: Opened):

@@ -23,6 +23,7 @@ def first_scan(uri: str, lidar: SpinningLidar, sigma: float) -> Scan:
     return replace(open_simulated(uri).run, lidar=replace(lidar, range_sigma=sigma)).sweep(0).scan
 
 
+@pytest.mark.slow_after(5)
 @pytest.mark.parametrize(
     "lidar", [SpinningLidar(), OUSTER, DOME, SolidStateLidar()], ids=["vlp", "os", "dome", "solid"]
 )

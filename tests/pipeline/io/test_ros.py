@@ -242,7 +242,7 @@ def test_a_cut_recording_gives_what_is_whole(opened: Opened, kind: str, tmp_path
     assert sum(source.losses.values()) > 0
 
 
-@pytest.mark.slow_after(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_drives_end_with_a_clear_error_or_with_losses(kind: str, tmp_path: Path):
     path = write_recording(kind, tmp_path, drive)

@@ -142,6 +142,7 @@ def test_a_lidar_on_its_side_is_named_rather_than_the_odometry(tmp_path: Path, o
     assert UNKNOWN_YAW in source.losses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("roll", "pitch", "lidar"),
     [

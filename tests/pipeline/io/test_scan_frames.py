@@ -261,7 +261,7 @@ def test_the_yaw_of_a_mounting_is_found_by_its_motion(degrees: int, tmp_path: Pa
     assert not source.losses
 
 
-@pytest.mark.slow_after(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("degrees", "stated"), [(90, 0), (60, -60), (90, 90), (33, 30)])
 def test_a_fixed_transform_with_another_yaw_than_the_motion_is_told(
     degrees: int, stated: int, tmp_path: Path, opened: Opened
@@ -280,6 +280,7 @@ def test_a_fixed_transform_with_another_yaw_than_the_motion_is_told(
         assert f"and not {stated};" in text
 
 
+@pytest.mark.slow
 def test_a_mounting_of_the_user_with_another_yaw_than_the_motion_is_told(tmp_path: Path, opened: Opened):
     options = SourceOptions(T_base_lidar=Pose3.identity())
     source = opened(write_recording("mcap", tmp_path, unlinked(math.radians(90))), options)
@@ -295,6 +296,7 @@ def test_odometry_of_a_robot_that_stands_contradicts_scans_that_move(tmp_path: P
     assert any("that contradict the odometry" in reason for reason in source.losses)
 
 
+@pytest.mark.slow
 def test_odometry_of_another_robot_is_left_out(tmp_path: Path, opened: Opened):
     def fill(author: Author, write: Write) -> None:
         for k in range(300):

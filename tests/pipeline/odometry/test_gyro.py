@@ -73,6 +73,7 @@ def test_a_bias_is_learnt_while_the_robot_stands_and_never_while_it_moves():
     assert after.sigma < 0.1 * before.sigma
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("blocks", [1, 10])
 def test_the_sigma_of_a_turn_knows_how_well_the_bias_was_learnt(blocks):
     z = []

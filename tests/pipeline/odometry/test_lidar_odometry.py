@@ -206,6 +206,7 @@ def test_a_sensor_that_sees_a_part_of_the_stand_turns_with_the_robot():
     assert abs(wrap_angle(np.diff(turned) - np.diff(true))[0]) < np.radians(1.0)
 
 
+@pytest.mark.slow
 def test_a_view_that_leaves_the_stand_does_not_end_in_a_false_minimum():
     """In the bend, a view of 70 degrees has some hundred points above the ground. Registered alone, they
     displaced the path by 0.74 m."""

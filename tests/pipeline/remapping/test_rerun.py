@@ -81,7 +81,7 @@ def drawn(rng: np.random.Generator) -> Parameters:
             continue  # two of them contradict each other
 
 
-@pytest.mark.slow_after(2)
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("seed", range(SETS))
 def test_a_rerun_gives_the_bytes_of_a_first_run(seed, known):
     parameters = drawn(np.random.default_rng(seed))

@@ -116,6 +116,7 @@ def test_ten_repairs_mend_a_broken_ring(seed):
     assert np.count_nonzero(apart.min(axis=1) < 1.0) <= 4, "only the twins and their neighbours"
 
 
+@pytest.mark.slow
 def test_the_quality_of_the_pose_is_said_to_be_of_the_map_before_the_tie():
     of, person = run(1)[0], repaired(1)
     assert of.frame.health.reason.startswith("the position is uncertain by")
@@ -156,6 +157,7 @@ def test_each_undone_repair_gives_the_map_before_it():
     assert back.repaired(of, []).frame.trees is of.frame.trees
 
 
+@pytest.mark.slow
 def test_a_forbidden_loop_lets_the_odometry_lead_and_a_tie_brings_the_map_back():
     of, truth = run(0, "constellation")
     loop = of.graph.loops[-1].scans

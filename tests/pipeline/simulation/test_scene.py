@@ -35,6 +35,7 @@ def test_each_scenario_opens_and_its_path_keeps_clear(name):
         assert walkers == plan.walking
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("name", PLAIN)
 def test_trunks_have_the_diameter_and_place_that_the_truth_tells(name):
     run = open_simulated(f"sim:{name}").run

@@ -87,6 +87,7 @@ def test_repeated_poses_of_one_source_are_consistent():
     assert 1.3 < np.mean(nees) < 4.9
 
 
+@pytest.mark.slow
 def test_the_drift_is_bounded_by_the_error_of_the_source():
     alone = np.mean([drive(seed, AWAY, poses=False)[0][-1, 1] for seed in range(8)])
     with_it, told = np.mean([drive(seed, AWAY)[0][-1, 1:] for seed in range(8)], axis=0)

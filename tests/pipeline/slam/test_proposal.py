@@ -29,6 +29,7 @@ def test_cells_find_who_stands_near(seed: int, radius: float) -> None:
     assert np.all(cells.head == -1)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("distance_max", [0.5, 1.0, 4.0])
 @given(seed=SEEDS)
 def test_pairs_are_all_within_the_gate_and_sorted(seed: int, distance_max: float) -> None:

@@ -129,6 +129,7 @@ def test_a_bad_day(name: str, place: str, seed: int) -> None:
     assert_survived(name, lived(place, seed, name))
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("name", ["stuck", "odometry ends", "jump of 0.5 m", "kidnapped"])
 @pytest.mark.parametrize(("place", "seed"), first_of([("few trees", 4), ("at 3 m/s", 3), ("dense", 5)]))
 def test_elsewhere(name: str, place: str, seed: int) -> None:
@@ -140,6 +141,7 @@ def test_stuck_from_the_start_where_more_trees_stand_than_people_walk(place: str
     assert_survived("stuck from the start", lived(place, seed, "stuck from the start"))
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("name", ["stuck", "odometry ends", "jump of 0.5 m", "gap, pushed", "kidnapped"])
 def test_with_fastslam_1(name: str) -> None:
     assert_survived(name, lived("stand", 6, name, parameters(**{"slam.method": "fastslam1"})))

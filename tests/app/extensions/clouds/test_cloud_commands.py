@@ -55,6 +55,7 @@ def test_info_tells_what_is_in_a_cloud_and_what_to_do_with_it(cloud, capsys, mon
     assert record["low_m"][:2] == pytest.approx(UTM[:2], abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_robot_drives_through_a_cloud_that_is_opened_as_a_run(cloud):
     opened, named = open_source(str(cloud)), open_source(f"sim:cloud?file={cloud}")
     assert opened.description.kind.startswith("simulated drive through a whole cloud (LAS 1.4")

@@ -50,6 +50,7 @@ def write(path: Path, points: np.ndarray, how: str = "") -> Path:
     return path
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize(
     ("name", "how", "kind"),
     [
@@ -250,6 +251,7 @@ def test_an_archive_that_would_unpack_to_more_than_it_says_stays_small(tmp_path)
     assert sum(len(part) for part in cloud.parts()) == (1 << 20) // 12
 
 
+@pytest.mark.slow
 def test_damaged_files_never_crash(tmp_path, points):
     rng = np.random.default_rng(5)
     for name in ("c.ply", "c.npy", "c.npz", "c.pcd"):

@@ -61,6 +61,7 @@ def read(
     return np.concatenate(list(cloud.parts())) + cloud.description.offset, cloud.description
 
 
+@pytest.mark.slow_after(5)
 @pytest.mark.parametrize(
     ("crs", "keys", "flat", "high"),
     [
@@ -116,6 +117,7 @@ def rows(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(text))
 
 
+@pytest.mark.slow
 def test_a_plot_in_feet_keeps_its_coordinates_and_gets_metric_diameters(tmp_path, points, capsys):
     file = las(tmp_path / "plot.laz", (points + PLACE) / US_FT, "EPSG:6430+6360")
     truth = tmp_path / "truth.csv"
@@ -187,6 +189,7 @@ def test_an_extent_of_millimetres_only(tmp_path, points):
     assert "millimetres" in about.unit
 
 
+@pytest.mark.slow
 def test_an_extent_that_is_none_of_metres_is_refused_with_the_flag(tmp_path, points, capsys):
     file = ply(tmp_path / "c.ply", 1000.0 * points + 0.25, "double")  # 15 x 15 m, or 150 x 150 m
     assert main(["map", file, "--out", str(tmp_path / "out")]) == 1
@@ -253,6 +256,7 @@ def test_coordinates_whose_steps_hide_the_stems_are_told(tmp_path, points, step,
     ]
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("up", ["y", "-y", "x", "-x", "-z"])
 @pytest.mark.parametrize("slope", [0.0, 0.2])
 def test_a_cloud_with_another_axis_up_is_turned(tmp_path, up, slope):
@@ -263,6 +267,7 @@ def test_a_cloud_with_another_axis_up_is_turned(tmp_path, up, slope):
     assert any("it was turned" in warning for warning in about.warnings)
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("cut", [2.0, 3.0, 5.0])
 def test_the_straight_side_of_a_plot_with_hardly_a_ground_is_no_ground(tmp_path, shared_data, cut):
     cloud = open_cloud(str(shared_data / "forest" / "LPine1_demo.laz"))
@@ -286,7 +291,7 @@ def real(shared_data: Path, name: str, cut: float | None = None, share: float = 
     return points if cut is None else points[points[:, 2] < np.percentile(points[:, 2], 1) + cut]
 
 
-@pytest.mark.slow_after(3)
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("name", ["pine_plot", "LPine1_demo", "MLS_Clip"])
 @pytest.mark.parametrize(
     ("up", "share"), [("z", 1.0), ("-z", 1.0), ("y", 1.0), ("-x", 1.0), ("z", 0.3), ("x", 0.3), ("-y", 0.3)]

@@ -75,6 +75,7 @@ def test_coordinates_of_a_country_and_many_points_are_a_cloud(tmp_path, sweep):
     assert is_cloud(pcd(tmp_path / "b.pcd", np.tile(sweep, (30, 1))))
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("uri", ["sim:wild?duration=1", "sim:dense?duration=1", "sim:stand?duration=1"])
 @pytest.mark.parametrize("thinned", [0.0, 0.05, 0.1])
 def test_a_sweep_is_a_scan(tmp_path, uri, thinned):

@@ -96,6 +96,7 @@ def test_a_cloud_is_mapped_in_steps_without_a_robot(session: Session) -> None:
     assert len(session.shown.path.x) == 0
 
 
+@pytest.mark.slow
 def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session) -> None:
     frame = mapped(session)
     at = frame.estimate.T_map_base.apply(frame.filtered[:, :2].astype(np.float64))
@@ -129,7 +130,7 @@ def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session
     assert status.status.one_step == session.status().one_step
 
 
-@pytest.mark.slow_after(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pine_plot.laz", "LPine1_demo.laz", "MLS_Clip.laz"])
 async def test_stems_of_a_cloud_begin_on_the_terrain_or_within_their_own_points(
     name: str, shared_data: Path
@@ -179,6 +180,7 @@ def test_the_latest_of_several_changes_wins(session: Session) -> None:
     assert session.status().revision == 4
 
 
+@pytest.mark.slow
 def test_other_parameters_do_not_map_the_cloud_again(session: Session) -> None:
     before = mapped(session)
     session.set_parameters(FOREST.replace({"clustering.eps": 0.5, "slam.distance_max": 2.0}), 2)
@@ -186,6 +188,7 @@ def test_other_parameters_do_not_map_the_cloud_again(session: Session) -> None:
     assert session.shown.frame is before
 
 
+@pytest.mark.slow
 def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session: Session) -> None:
     frame = mapped(session)
     for row, number in enumerate(frame.trees.number.tolist()):
@@ -210,6 +213,7 @@ def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session
         cloud_run(session).tree_story(99)
 
 
+@pytest.mark.slow
 def test_the_section_at_breast_height_shows_each_stem(session: Session) -> None:
     assert session.run is not None
     assert len(at_breast(session.run.accumulated).cells) == 0
@@ -222,6 +226,7 @@ def test_the_section_at_breast_height_shows_each_stem(session: Session) -> None:
         tree_picture(session.run, 1)
 
 
+@pytest.mark.slow
 def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(session: Session) -> None:
     frame = mapped(session)
     others = 0
@@ -268,6 +273,7 @@ def test_a_seek_or_another_play_leaves_the_map_as_it_is(session: Session) -> Non
     assert session.shown.frame is before
 
 
+@pytest.mark.slow
 def test_a_damaged_cloud_is_refused_and_the_address_of_a_drive_is_no_map(cloud: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.laz"
     broken.write_bytes(cloud.read_bytes()[:300])
@@ -279,6 +285,7 @@ def test_a_damaged_cloud_is_refused_and_the_address_of_a_drive_is_no_map(cloud: 
     drive.close()
 
 
+@pytest.mark.slow
 def test_a_run_of_scans_follows_a_cloud(session: Session) -> None:
     mapped(session)
     session.open(Open("sim:stand?duration=2", "auto", 0))

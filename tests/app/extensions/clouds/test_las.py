@@ -41,6 +41,7 @@ def test_points_are_read_less_an_offset_that_is_kept(tmp_path, points, name, ver
     assert not cloud.losses
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("crs", ["EPSG:32611", None])
 def test_a_cloud_is_mapped_into_the_files_of_a_run(tmp_path, points, crs, capsys):
     file = write_las(tmp_path / "plot.laz", points, offset=UTM, crs=crs)

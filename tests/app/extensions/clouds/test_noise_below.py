@@ -46,6 +46,7 @@ def test_noise_below_the_ground_hides_no_stem(depth, share, slope):
     assert away.min(axis=0).max() < 0.03
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("name", ["pine_plot", "LPine1_demo", "MLS_Clip"])
 def test_noise_below_a_real_plot_changes_no_ground(shared_data, name):
     cloud = open_cloud(str(shared_data / "forest" / f"{name}.laz"))

@@ -60,6 +60,7 @@ def fits_of_scan(run, trees, k):
     return np.array(rows).reshape(-1, 4)
 
 
+@pytest.mark.slow
 def test_diameters_on_real_bark_are_near_those_of_other_tools(fits):
     """The reference is at breast height; many stems are seen lower, where they are 1 to 3 cm wider."""
     error, sigma = fits[:, 0], fits[:, 1]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+import pytest
+
 from app.extensions.fleet.fleet import RobotWatch
 from app.extensions.fleet.members import robots_at, watched_router
 from app.sources.live_address import ZenohAddress, parse_address
@@ -50,6 +52,7 @@ async def test_robots_get_a_dashboard_as_they_come(router: int, robots: Callable
         await fleet.close()
 
 
+@pytest.mark.slow
 def test_a_router_with_several_robots_is_a_fleet(router: int, robots: Callable[[str], Robot]):
     one = Open(f"zenoh:tcp/127.0.0.1:{router}")
     robots("red")
@@ -67,5 +70,6 @@ def test_a_router_with_several_robots_is_a_fleet(router: int, robots: Callable[[
     assert watched_router([one, one]) is None
 
 
+@pytest.mark.slow
 def test_a_router_that_does_not_answer_is_no_fleet():
     assert robots_at(address_at(free_port())) == []

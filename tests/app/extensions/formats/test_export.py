@@ -25,6 +25,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_what_is_exported_maps_to_the_same_trees(mapped, tmp_path, capsys):
     states, back = tmp_path / "states", tmp_path / "back"
     told = stemmap(capsys, "export", mapped, "--out", states)

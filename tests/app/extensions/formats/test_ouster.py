@@ -137,6 +137,7 @@ def assert_same(scan: Scan, info: Any, made: Any) -> None:
     assert scan.ring.tolist() == rings.tolist()
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize(("container", "more"), [("bag", b"\0"), ("mcap", b""), ("db3", b"")])
 def test_points_times_and_rings_are_those_of_the_library(
@@ -155,6 +156,7 @@ def test_points_times_and_rings_are_those_of_the_library(
     assert (read.family, read.times[:12]) == ("Ouster", "field t in n")
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize(("rings", "columns"), [(32, 1024), (128, 1024), (64, 2048), (16, 512)])
 def test_models_with_other_rings_and_columns(rings: int, columns: int, tmp_path: Path, opened: Opened):
     info = sensor(RNG19, rings, columns)
@@ -338,6 +340,7 @@ def capture(path: Path, packets: Packets, imu: Packets = [], port: int = 7502, s
     return path
 
 
+@pytest.mark.slow_after(2)
 @pytest.mark.parametrize("profile", [LEGACY, RNG19])
 @pytest.mark.parametrize("size", [1480, 65_000])
 @pytest.mark.parametrize("port", [7502, 9000])

@@ -29,6 +29,7 @@ def lines(points: np.ndarray, form: str, *, comma: bool = False) -> str:
     return text.replace(".", ",") if comma else text
 
 
+@pytest.mark.slow_after(12)
 @pytest.mark.parametrize(
     ("name", "head", "form"),
     [
@@ -130,6 +131,7 @@ def table(header: str, row: str) -> str:
     return header + "\n" + "".join(f"{row}\n".replace("#", str(k)) for k in range(300))
 
 
+@pytest.mark.slow_after(7)
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -242,6 +244,7 @@ def test_a_line_without_end_takes_no_memory(tmp_path: Path):
     assert sum(len(part) for part in cloud.points()) == 500
 
 
+@pytest.mark.slow
 def test_a_text_is_mapped_told_of_and_driven_through(tmp_path: Path, capsys):
     points = plot(np.random.default_rng(1), per_m2=900)
     text = io.StringIO()

@@ -77,6 +77,7 @@ def test_a_second_run_finds_its_start_and_keeps_the_numbers(stand, tmp_path, cap
     assert record["distance_m"] == pytest.approx(2 * once["distance_m"], rel=0.05)  # nor is the jump a drive
 
 
+@pytest.mark.slow
 def test_the_same_recording_twice_is_warned_of(stand, tmp_path, capsys):
     words = ["map", PLAIN, "--out", str(tmp_path / "a"), "--stop-after", "5"]
     assert main(words) == 0

@@ -79,6 +79,7 @@ def test_another_stand_is_not_found_and_says_so(stand, tmp_path, capsys):
     assert not (tmp_path / "trees_in_map.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_small_file_gives_the_same_place(stand, tmp_path, capsys):
     file = tmp_path / "stand.stems"
     assert main(["pack", str(stand), "--out", str(file)]) == 0

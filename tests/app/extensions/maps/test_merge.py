@@ -59,6 +59,7 @@ def _cut(whole, late, skip_s):
         writer.finish()
 
 
+@pytest.mark.slow
 def test_the_first_run_keeps_its_numbers_and_places(runs):
     before = {row["tree"]: row for row in rows(runs / "a")}
     after = {row["tree"]: row for row in rows(runs / "both")}

@@ -26,6 +26,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_what_is_known_is_not_computed_again_and_a_run_that_fails_is_said(
     here, tmp_path, capsys, monkeypatch
 ):

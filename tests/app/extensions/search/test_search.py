@@ -196,6 +196,7 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
     assert "written to" in said
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [

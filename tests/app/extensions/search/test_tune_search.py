@@ -126,6 +126,7 @@ def test_a_recording_that_is_gone_cannot_be_opened_again(tmp_path: Path, scheme:
     assert "does not exist any more" in _why_gone(f"{scheme}{tmp_path}/gone.mcap")
 
 
+@pytest.mark.slow
 async def test_one_search_at_a_time_and_leaving_the_run_ends_its_process():
     search = TuneSearch(lambda _told: None, says(SAID[0], then="time.sleep(600)"))
     await search.start(PLAN)

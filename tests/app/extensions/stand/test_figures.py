@@ -232,6 +232,7 @@ def test_trees_that_people_add_in_the_part_out_of_sight_change_no_figure():
     assert f.warnings == ()
 
 
+@pytest.mark.slow
 def test_trees_that_are_not_detected_are_added_with_their_error():
     random = np.random.default_rng(2)
     errors, told = [], []
@@ -333,6 +334,7 @@ def test_trees_that_people_confirmed_measured_or_added_are_not_false():
     assert every.values["n_ha"].se == pytest.approx(10.0 * 40 * 0.01)
 
 
+@pytest.mark.slow
 def test_the_counting_error_of_all_plots_does_not_decrease_with_their_number():
     """Maps drawn with a share of false trees that all of their plots have."""
     random = np.random.default_rng(3)
@@ -497,6 +499,7 @@ def test_mean_heights_are_those_of_the_textbook():
     assert combined({"a": f, "b": unknown})["mean_height_m"].value == pytest.approx(55.0 / 3)
 
 
+@pytest.mark.slow
 def test_heights_of_a_part_of_the_trees_are_a_sample_of_all():
     """Stands of which 42 of 50 heights are known, with errors of heights and diameters."""
     random = np.random.default_rng(8)

@@ -16,6 +16,7 @@ from tests.app.server_for_tests import Running
 from tests.app.web.test_routes import exported_twice, show
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize("suffix", ["gpkg", "dxf", "xlsx"])
 async def test_the_export_gives_the_bytes_of_the_command(both: Running, tmp_path: Path, suffix: str) -> None:
     reply, file = await exported_twice(both, tmp_path, suffix)

@@ -55,6 +55,7 @@ def points_of(dashboard: Dashboard) -> list[dict[str, Any]]:
     return [{**mark, "east": e, "north": n} for mark, (e, n) in zip(marks, known, strict=True)]
 
 
+@pytest.mark.slow
 async def test_control_points_place_the_files_as_on_the_command_line(both, tmp_path: Path) -> None:
     client, dashboard = both
     await look(dashboard)
@@ -124,6 +125,7 @@ async def test_rows_of_a_table_are_kept_where_others_are_wrong(both) -> None:
     assert await stored(client) is None
 
 
+@pytest.mark.slow_after(1)
 @pytest.mark.parametrize(
     ("table", "words"),
     [

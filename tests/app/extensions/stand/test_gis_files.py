@@ -239,7 +239,7 @@ def test_the_same_run_gives_the_same_bytes(runs, tmp_path, capsys, suffix):
     assert f"x.{suffix}" in first
 
 
-@pytest.mark.slow_after(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("hash_seed", ["0", "4"])  # two orders of the set of types of ezdxf
 def test_a_drawing_lists_its_types_in_one_order(runs, tmp_path, hash_seed):
     program = "import sys; from app.cli import main; sys.exit(main(sys.argv[1:]))"

@@ -62,6 +62,7 @@ async def test_a_rejected_tree_is_marked_in_the_table_and_counts_in_no_figure(bo
     assert len(features) == len(rows) - 1
 
 
+@pytest.mark.slow
 async def test_the_way_of_coverage_is_that_of_the_child_process(both, monkeypatch) -> None:
     client, dashboard = both
     await look(dashboard)
@@ -183,6 +184,7 @@ async def test_figures_refer_to_what_was_observed(both) -> None:
     assert (wrong.status_code, "'dbh'" in wrong.text) == (422, True)
 
 
+@pytest.mark.slow
 async def test_the_layer_of_an_export_is_imported_again(both, tmp_path) -> None:
     client, dashboard = both
     await look(dashboard)

@@ -20,6 +20,7 @@ from tests.app.batch.test_runs import play, runs, show
 from tests.app.server_for_tests import BEARER, Running, running
 
 
+@pytest.mark.slow
 async def test_two_runs_of_one_recording_are_compared(both: Running) -> None:
     client, dashboard = both
     await play(dashboard, n_trees=4)

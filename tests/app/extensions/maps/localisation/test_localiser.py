@@ -96,6 +96,7 @@ def test_a_moved_map_gives_the_moved_fix(motion):
     assert abs(wrap_angle(moved.yaw - two.T_map_odom.yaw)) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_place_of_many_stems_outside_of_the_map_is_said_to_be_none_of_it():
     here, there = stand(3, density=0.08), stand(4)
     _, got = last(Localiser(stored(there)), here, way(3, SIDE), 3)
