@@ -48,9 +48,9 @@ def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Conte
     """Return a dict from the number of each reviewed tree to its review: CONFIRMED for the class "tree",
     REJECTED for another class, SKIPPED if no annotation of the tree states a class.
 
-    A tree has at most one annotation. It is one to which no other tree is nearer, and nearer than its reach
-    (SAME_THING if it has none): the nearest one that states a class, of equally near ones the last. The
-    others belong to no tree. The page has the same rule (`paired` in static/js/annotate/annotations.js).
+    A tree has at most one annotation. It is one to which no other tree is nearer, and nearer than `reach_of`
+    it: the nearest one that states a class, of equally near ones the last. The others belong to no tree. The
+    page has the same rule (`paired` in static/js/annotate/annotations.js).
 
     Args:
         numbers, position: Numbers of the trees, and their positions in the map, shape (T, 2) [m].
@@ -70,15 +70,21 @@ def annotation_of_tree(position: Float, reviews: Sequence[Content]) -> dict[int,
     distance, row = cKDTree(position).query([(content.x, content.y) for content in reviews])
     states_class = np.array([content.kind != SKIPPED for content in reviews])
     order = np.lexsort((-distance, states_class))  # the one that counts comes last
-    reach = [SAME_THING if content.reach is None else content.reach for content in reviews]
-    return {int(row[k]): int(k) for k in order if distance[k] < reach[k]}
+    return {int(row[k]): int(k) for k in order if distance[k] < reach_of(reviews[k])}
+
+
+def reach_of(content: Content) -> float:
+    """Return the distance below which an annotation can be about a mapped tree [m]: SAME_THING or, of a
+    rejection, its reach. Two trees this near are often two copies of one stem, so that a confirmation holds
+    for the copy that a later map has."""
+    return SAME_THING if content.reach is None or content.kind == "tree" else content.reach
 
 
 def reach_at(position: Float, place: tuple[float, float]) -> float | None:
-    """Return the distance below which an annotation that is made now can be about a mapped tree [m]; None for
+    """Return the distance below which a rejection that is made now can be about a mapped tree [m]; None for
     SAME_THING.
 
-    An annotation is about the tree at its place. If a later map lacks that tree, the annotation must not be
+    A rejection is about the tree at its place. If a later map lacks that tree, the rejection must not be
     taken for one of its neighbour, which was there before. The boundary is half-way between the distances of
     both.
 

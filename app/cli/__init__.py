@@ -78,7 +78,9 @@ def _keep_bytecode() -> None:
     library = find_spec("numpy")
     if not sys.dont_write_bytecode or sys.pycache_prefix or library is None or library.cached is None:
         return
-    if not Path(library.cached).exists():
+    if Path(library.cached).exists():
+        return
+    with contextlib.suppress(RuntimeError):  # there may be no home
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(cache / "stemmap" / "bytecode")
         sys.dont_write_bytecode = False

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.batch.run_edits import SAME_THING
+from app.batch.run_edits import SAME_THING, reach_of
 from app.batch.run_folder import TAPE_SIGMA
 from app.store.async_store import AsyncStore
 from app.store.records import (
@@ -31,7 +31,7 @@ from app.store.records import (
 )
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
-from pipeline.repairs.record import GATE, Repair, identity_of, numbers_at
+from pipeline.repairs.record import GATE, Repair, identity_of, nearest_tree, numbers_at
 from pipeline.repairs.trees import numbers_of, repaired_trees
 from pipeline.types.records import Trees, TruthTrees
 
@@ -413,9 +413,9 @@ def import_plan(
 ) -> ImportPlan:
     """Return what an import of a table does.
 
-    A row within SAME_THING of an annotation is about the same object, and adds no second annotation; only the
-    nearest row is about it, so that two stems of a table stay two. A row at the place of an earlier row is
-    about the object of that row. A row gives its DBH to an annotation of the same class without DBH. With
+    A row nearer to an annotation than `reach_of` it is about the same object, and adds no second one; only
+    the nearest row is about it, so that two stems of a table stay two. A row at the place of an earlier row
+    is about the object of that row. A row gives its DBH to an annotation of the same class without DBH. With
     another class or another DBH it is a conflict, and nothing is stored, unless it replaces an annotation.
 
     Args:
@@ -442,7 +442,7 @@ def import_plan(
             here.dbh is not None and content.dbh is not None and abs(here.dbh - content.dbh) > _SAME_DBH
         )
         if here.kind != content.kind or is_other_dbh:
-            if replaces and j < len(rows) and j not in replaced:
+            if replaces and j < len(rows) and j not in replaced | filled:
                 known[j] = replace(here, kind=content.kind, dbh=content.dbh or here.dbh)
                 replaced.add(j)
             else:
@@ -476,6 +476,7 @@ def _same_things(known: Sequence[Content], number: int) -> dict[int, tuple[int, 
         (max(math.dist(places[k], places[j]), _SAME_PLACE), known[k].kind != known[j].kind, k, j)
         for k, annotations in enumerate(near, start=number)
         for j in annotations
+        if math.dist(places[k], places[j]) < reach_of(known[j])
     ]
     same, taken = dict[int, tuple[int, float]](), set[int]()
     for distance, _, k, j in sorted(pairs):
@@ -483,6 +484,17 @@ def _same_things(known: Sequence[Content], number: int) -> dict[int, tuple[int, 
             same[k] = j, distance
             taken.add(j)
     return same
+
+
+def _trees_of(trees: Trees, rows: Sequence[Annotation]) -> dict[int, int]:
+    """Return a dict from the id of each annotation that is about a tree to the number of this tree."""
+    places = [(row.content.x, row.content.y) for row in rows]
+    nearest = [nearest_tree(trees, place, confirmed=True) for place in places]
+    return {
+        row.id: int(trees.number[k])
+        for row, place, k in zip(rows, places, nearest, strict=True)
+        if k is not None and math.dist(place, trees.position[k]) < reach_of(row.content)
+    }
 
 
 def carried_by(
@@ -501,11 +513,7 @@ def carried_by(
         repairs: The repairs, in their order; those of loops change nothing here.
     """
     contents: dict[int, Content | None] = {row.id: row.content for row in rows}
-    tree_of = {
-        row.id: number
-        for row in rows
-        for number in numbers_at(trees, [(row.content.x, row.content.y)], confirmed=True)
-    }
+    tree_of = _trees_of(trees, rows)
     for repair in (repair for repair in repairs if not repair.is_of_loop):
         numbers, before = numbers_of(trees, repair), _places(trees)
         trees, problem = repaired_trees(trees, repair)
@@ -537,11 +545,7 @@ def carried_along(
         rows: The annotations of objects and skipped trees.
     """
     contents: dict[int, Content | None] = {row.id: row.content for row in rows}
-    tree_of = {
-        row.id: number
-        for row in rows
-        for number in numbers_at(before, [(row.content.x, row.content.y)], confirmed=True)
-    }
+    tree_of = _trees_of(before, rows)
     old, new = _places(before), _places(after)
     stays = _successors(before, after, pair)
     for number, other in stays.items():
@@ -657,7 +661,7 @@ def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[s
 
 def row_payload(row: Annotation) -> dict[str, Any]:
     """Return an annotation of an object as a dict of JSON values for the dashboard: `id`, `x` and `y` in the
-    map [m], `kind`, `dbh_cm` (None if unknown), `reach_m` (see `Content`, SAME_THING if it has none), `who`,
+    map [m], `kind`, `dbh_cm` (None if unknown), `reach_m` (see `reach_of`), `who`,
     `at_s` (time of the last edit [s since 1970], to the millisecond) and `version`."""
     content = row.content
     return {
@@ -666,7 +670,7 @@ def row_payload(row: Annotation) -> dict[str, Any]:
         "y": round(content.y, 4),
         "kind": content.kind,
         "dbh_cm": None if content.dbh is None else round(100.0 * content.dbh, 2),
-        "reach_m": SAME_THING if content.reach is None else round(content.reach, 4),
+        "reach_m": round(reach_of(content), 4),
         "who": row.who,
         "at_s": round(row.at_ns / 1e9, 3),
         "version": row.version,

@@ -53,7 +53,8 @@ class _Page:
         dirty: Whether `best` is not written.
         changes: Changes of parameters that are not written.
         recordings: Absolute paths of the files to which the run was recorded.
-        log: Events of a live run, see `RunRecorder.logged`; None without any.
+        logs: Events of a live run, see `RunRecorder.logged`, from the first start of the worker and from each
+            restart; the last one grows unless `has_restarted`.
         writer: Task that writes the record.
         ended: Set when the run is left.
         complete: Whether the run came to its end and its result files are not written.
@@ -68,7 +69,8 @@ class _Page:
     dirty: bool = False
     changes: list[Change] = field(default_factory=list)
     recordings: list[str] = field(default_factory=list)
-    log: dict[str, Any] | None = None
+    logs: list[dict[str, Any]] = field(default_factory=list)
+    has_restarted: bool = False
     writer: asyncio.Task[None] | None = None
     ended: asyncio.Event = field(default_factory=asyncio.Event)
     complete: bool = False
@@ -116,6 +118,7 @@ class RunRecorder:
             again: The worker was restarted and opened the same run again; its record continues.
         """
         if again and self._page is not None and self._page.beginning.request.uri == opened.uri:
+            self._page.has_restarted = True
             return
         self.leave()
         if run is None:
@@ -159,9 +162,14 @@ class RunRecorder:
         Args:
             log: `events` (see `Events.as_plain`), and `start_s`, the time of the first scan [s since 1970].
         """
-        if self._page is not None and log["events"]:
-            self._page.log, self._page.dirty = log, True
-            self._soon(self._page)
+        page = self._page
+        if page is None or not log["events"]:
+            return
+        if not page.has_restarted:
+            del page.logs[-1:]
+        page.logs.append(log)
+        page.has_restarted, page.dirty = False, True
+        self._soon(page)
 
     def scored(self, scores: dict[str, Any] | None) -> None:
         """Record the score of the scan that was displayed last; ignored for None, and if that scan is not the
@@ -244,7 +252,7 @@ class RunRecorder:
         page.dirty, page.changes = False, []
 
         def work(store: Store) -> None:
-            figures = _figures_of(state, scores, page.all_scans, page.log)
+            figures = _figures_of(state, scores, page.all_scans, page.logs)
             if page.record is None:
                 page.record = store.book.begin(page.beginning, figures)
             else:
@@ -292,17 +300,17 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
 
 
 def _figures_of(
-    state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None, log: dict[str, Any] | None
+    state: ShownRun, scores: dict[str, Any] | None, all_scans: int | None, logs: list[dict[str, Any]]
 ) -> RunFigures:
     """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
     (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth), in the
     coordinates of the files, which are those of the map plus `offset`; `recordings`, see `ShownRun`; and
-    `log`.
+    `logs`.
 
     Args:
         state, scores: The state, and its scores; None if there are none.
         all_scans: Number of scans of the source; None if unknown.
-        log: Events of a live run, see `RunRecorder.logged`; None of other runs.
+        logs: See `_Page`.
     """
     shown = state.shown
     trees = trees_payload(in_file(shown.frame.trees, state.one_step), start_ns=state.start_ns)
@@ -323,7 +331,7 @@ def _figures_of(
             "truth": None if truth is None else truth["trees"],
             "offset": list(state.offset[:2]),
             "recordings": list(state.recordings),
-            "log": log,
+            "logs": list(logs),
         },
     )
 

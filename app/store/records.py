@@ -51,8 +51,8 @@ class Content:
         dbh: Diameter at breast height [m], None if not measured.
         values: JSON values of a FRAME, with the record of a `MapFrame` as `frame`, of a REPAIR, with the
             fields of `Repair`, and of classes of extensions; None for KINDS and SKIPPED.
-        reach: Distance below which it can be about a mapped tree [m], because trees beyond were other ones
-            when it was made; None if no other one was near, see `run_edits.reach_at`.
+        reach: Distance below which a rejection can be about a mapped tree [m], because trees beyond were
+            other ones when it was made; None if no other one was near, see `run_edits.reach_at`.
     """
 
     x: float
@@ -156,7 +156,8 @@ class RunFigures:
         preset: Name of the preset.
         parameters: Dict from the dotted name of each parameter to its value.
         scores: Result of `score_payload`, or None.
-        map: Dict with `trees`, `path`, `truth` and, of a live run, `recordings`, lists of JSON values.
+        map: Dict with `trees`, `path`, `truth` and, of a live run, `recordings` and `logs`, lists of JSON
+            values.
     """
 
     scans: int

@@ -82,7 +82,7 @@ def test_runs_are_stored_renamed_deleted_and_replayed(own: Dashboard, tmp_path: 
         run["map"]["recordings"] = ["/data/north.mcap", "/data/south.mcap"]
         stop = {"t": 3.0, "kind": "stop", "text": "Obstacle in the stop zone", "for_s": 2.5, "noted_s": 1.7e9}
         tree = {"t": 4.0, "kind": "tree", "text": "Tree 1 mapped"}
-        run["map"]["log"] = {"events": [stop, tree], "start_s": 0.0}
+        run["map"]["logs"] = [{"events": [stop, tree], "start_s": 0.0}]
         route.fulfill(json={**run, "live": True})
 
     page.route("**/api/runs/*", as_live)

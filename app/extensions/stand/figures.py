@@ -32,8 +32,8 @@ UNLIKE_GAPS = 0.025
 # have 1.5 times the mean basal area of the others: 1 - 1 / (0.8 + 0.2 * 1.5). The same share is used for
 # heights: the tops of short trees are hidden more often than those of tall ones.
 UNMEASURED = 0.2
-# Share of the trees that a map of stands with undergrowth lacks: 5 of about 420
-# (docs/results.md, `sim:wild`).
+# Share of the trees that a map of stands with undergrowth lacks: 5 of about 420 in `sim:wild`
+# (docs/results.md).
 MISSED = 0.01
 FAR = 40.0  # standard deviations, beyond which a normal distribution is 0 or 1 in double precision
 
@@ -312,8 +312,6 @@ def stand_figures(
         )
         values = _without_errors(values, _OF_DIAMETERS)
     values.update(_height_figures(kept, known, parameters.dbh_shared_sigma))
-    if without_height:
-        values = _without_errors(values, _OF_HEIGHTS)
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _as_known(_classes(kept, trees, share, seen, parameters), values)
     return StandFigures(
@@ -363,7 +361,6 @@ _OF_AREA = ("n_ha", "g_ha", "v_ha", "n_ha_corrected", "g_ha_corrected", "v_ha_co
 _OF_DIAMETERS = (
     "g_ha", "v_ha", "g_ha_corrected", "v_ha_corrected", "dg_cm", "mean_dbh_cm", "dominant_dbh_cm", "sdi",
 )  # fmt: skip
-_OF_HEIGHTS = ("mean_height_m", "lorey_height_m")
 
 
 def _without_errors(values: dict[str, Estimate], names: Sequence[str] = _OF_AREA) -> dict[str, Estimate]:
@@ -414,25 +411,29 @@ def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
     between plots (ratio estimator), at least that of the errors of the plots: a few plots can be alike by
     chance. The counting error is added to it: all plots share it, so that it neither varies between them nor
     decreases with their number. The weights are the observed areas, for `_plain` names the whole areas. The
-    error is NaN for one plot. Plots in which a value is NaN do not count; if all are NaN, so is the mean."""
+    error is NaN for one plot, and if that of a plot with trees is: what makes it unknown, as many trees
+    without a diameter, biases the mean too. Plots in which a value is NaN do not count; if all are NaN, so is
+    the mean."""
     result = {}
     for name in FIGURES:
+        is_plain = name.endswith("_plain")
         rows = [
-            (f.area if name.endswith("_plain") else f.seen, *f.values[name], f.counting.get(name, 0.0))
+            (f.area if is_plain else f.seen, *f.values[name], f.counting.get(name, 0.0), f.trees)
             for f in plots.values()
             if math.isfinite(f.values[name].value)
         ]
         if not rows:
             result[name] = Estimate()
             continue
-        weight, value, se, counting = np.array(rows).T
+        weight, value, se, counting, trees = np.array(rows).T
+        is_unknown = not is_plain and bool((np.isnan(se) & (trees > 0)).any())
         own = np.maximum(np.square(np.nan_to_num(se)) - np.square(counting), 0.0)
         share = weight / weight.sum()
         mean, k = float(share @ value), len(rows)
         within = float(np.square(share) @ own)
         between = k / max(k - 1, 1) * float(np.square(share * (value - mean)).sum())
         error = math.sqrt(max(between, within) + float(share @ counting) ** 2)
-        result[name] = Estimate(mean, error if k > 1 else math.nan)
+        result[name] = Estimate(mean, math.nan if k == 1 or is_unknown else error)
     return result
 
 
@@ -549,7 +550,8 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
 
 def _height_figures(trees: PlotTrees, found: float, common: float) -> dict[str, Estimate]:
     """Return a dict from "mean_height_m" and "lorey_height_m" to estimates, without those that no tree has
-    the measurements for. Errors as in `_diameter_figures`; `common` is the shared error of diameters [m]."""
+    the measurements for. Errors as in `_diameter_figures`, NaN if more than UNMEASURED of the trees lack the
+    measurements; `common` is the shared error of diameters [m]."""
     if trees.height is None or trees.height_sigma is None:
         return {}
     h = np.stack([trees.height, trees.dbh], axis=1)
@@ -570,7 +572,9 @@ def _height_figures(trees: PlotTrees, found: float, common: float) -> dict[str, 
         known = np.isfinite(h[:, :columns]).all(axis=1)
         if known.any():
             measured, error, of_all = (each[known, :columns] for each in (h, sigma, shared))
-            result[name] = _with_error(figure, measured, error, of_all, found * float(known.mean()))
+            estimate = _with_error(figure, measured, error, of_all, found * float(known.mean()))
+            is_known = known.mean() >= 1.0 - UNMEASURED
+            result[name] = estimate if is_known else Estimate(estimate.value, math.nan)
     return result
 
 
@@ -627,8 +631,8 @@ def _classes(
     """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
     included; none if no tree has a diameter. The first class begins at the minimum diameter, which makes it
     narrower unless that is a multiple of the width. Trees without a diameter are left out. The standard
-    errors contain the counting error, the part of the plot out of sight and the errors of the diameters, by
-    which trees belong to another class.
+    errors contain the missed trees (MISSED), the part of the plot out of sight and the errors of the
+    diameters, by which trees belong to another class.
 
     Args:
         trees: Trees of the observed part from the minimum diameter.
@@ -649,7 +653,8 @@ def _classes(
         low, high = max(k * width, parameters.dbh_min), (k + 1) * width
         inside = known.where(of == k)
         basal, variance = _basal_areas(inside, common)
-        uncounted = inside.counting(parameters.count_error)
+        # Of the false trees, 15 of 17 have no diameter (docs/results.md), so that no class has them.
+        uncounted = np.minimum(inside.counting(parameters.count_error), MISSED)
         unsure = _variance_of_number(every, low, high, common)
         n_se = math.sqrt(rest * len(basal) + unsure + float(uncounted.sum()) ** 2)
         middle = _basal_area(0.5 * (low + high))

@@ -14,10 +14,10 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
-from app.batch.run_edits import annotation_of_tree, reach_at
+from app.batch.run_edits import SAME_THING, annotation_of_tree, reach_at
 from app.dashboard.annotations import Against, carried_back, import_plan, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.store.records import MOST_ANNOTATIONS, REPAIR, Author, Content, contents_of, moment
+from app.store.records import MOST_ANNOTATIONS, REPAIR, SKIPPED, Author, Content, contents_of, moment
 from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
 from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
@@ -89,7 +89,7 @@ async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
     """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
     and not exported); return its number (`id`) and the counts of edits, see `edited`, with 201. 409 if
     another run was opened meanwhile, nothing can be annotated, or the run has MOST_ANNOTATIONS."""
-    content = replace(body.content, reach=_reach_at(dashboard, body))
+    content = replace(body.content, reach=_reach_at(dashboard, body.x, body.y))
     (added,) = await apply_edit(dashboard, body, Store.add, [content])
     return await edited(dashboard, body, {"id": added}, 201)
 
@@ -98,12 +98,7 @@ async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
 async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Response:
     """Change an annotation; 409 if it does not have this version any more or another run was opened, 404 for
     an unknown one. Return its number (`id`) and the counts of edits, see `edited`."""
-    editor = dashboard.annotation_editor
-    before = next((row.content for row in [*editor.rows, *editor.skipped] if row.id == number), None)
-    if before is not None and math.dist((body.x, body.y), (before.x, before.y)) < _SAME_PLACE_M:
-        content = replace(body.content, reach=before.reach)
-    else:
-        content = replace(body.content, reach=_reach_at(dashboard, body))
+    content = replace(body.content, reach=_reach_after(dashboard, number, body))
     await apply_edit(dashboard, body, Store.change, number, body.version, content)
     return await edited(dashboard, body, {"id": number})
 
@@ -157,10 +152,11 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
     plan = import_plan(dashboard.annotation_editor.rows, contents, replaces=body.replaces)
     changed = [*plan.filled, *plan.replaced]
-    if plan.added or changed:
-        await apply_edit(dashboard, body, Store.edit, plan.added, changed)
+    added = [replace(each, reach=_reach_at(dashboard, each.x, each.y)) for each in plan.added]
+    if added or changed:
+        await apply_edit(dashboard, body, Store.edit, added, changed)
     payload = {
-        "added": len(plan.added),
+        "added": len(added),
         "filled": len(plan.filled),
         "replaced": len(plan.replaced),
         "left_out": plan.repeated,
@@ -219,12 +215,27 @@ def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     return [{**row, "x": row["x"] + x, "y": row["y"] + y, "tree": tree} for row, tree in rows]
 
 
-def _reach_at(dashboard: Dashboard, body: _AddAnnotation) -> float | None:
+def _reach_at(dashboard: Dashboard, x: float, y: float) -> float | None:
     """Return the reach of an annotation in the map of the shown scan, see `reach_at`."""
     if dashboard.shown is None:
         return None
     trees = dashboard.shown.frame.trees
-    return reach_at(trees.position[trees.confirmed], (body.x, body.y))
+    return reach_at(trees.position[trees.confirmed], (x, y))
+
+
+def _reach_after(dashboard: Dashboard, number: int, body: _AnnotationChange) -> float | None:
+    """Return the reach of an annotation after a change. It stays if neither place nor class changes, and if
+    the annotation is about no tree of the shown map and stays near its place: it is about none then."""
+    editor = dashboard.annotation_editor
+    before = next((row.content for row in [*editor.rows, *editor.skipped] if row.id == number), None)
+    if before is not None:
+        moved = math.dist((body.x, body.y), (before.x, before.y))
+        has_no_tree = before.kind != SKIPPED and before not in _trees_of(dashboard)
+        if moved < (SAME_THING if has_no_tree else _SAME_PLACE_M) and (
+            has_no_tree or body.kind == before.kind
+        ):
+            return before.reach
+    return _reach_at(dashboard, body.x, body.y)
 
 
 def _trees_of(dashboard: Dashboard) -> dict[Content, int]:

@@ -158,7 +158,7 @@ function latest({ id, version }) {
 export function change(row, fields) {
   const tree = treeOf(treeNumberOf(row)), { x, y, kind, dbh_cm } = { ...row, ...fields };
   const isAnswer = tree && x === row.x && y === row.y;
-  return edit(() => patched(row, fields), isAnswer ? answerOf(tree, kind, dbh_cm) : null);
+  return edit(() => patched(row, fields), isAnswer ? { ...answerOf(tree, kind, dbh_cm), before: row, isAsked: "dbh_cm" in fields } : null);
 }
 
 async function patched(row, fields) {
@@ -209,7 +209,7 @@ async function turn(where, word, subjects) {
   const single = changes.length === 1 && changes[0].name === "annotation" ? changes[0] : null;
   if (!single) return showNews(`${word}: ${countsText(changes)}.`);
   const now = isUndo ? single.was ?? single.is : single.is ?? single.was;
-  const tree = nearest(trees(), (each) => distance(each, now), state.annotations.same_thing_m);
+  const tree = nearest(trees(), (each) => distance(each, now), now.reach_m ?? state.annotations.same_thing_m);
   showNews(`${word}: ${changeText(single, tree)}.`);
   if (tree) select(tree.number);
 }
@@ -246,7 +246,7 @@ export const importTable = (table, unit, replaces) => edit(() => call("POST", "/
 
 // {ofTree, treeOf}: the annotation of each found tree by its number, and the number of the tree of each annotation by its id.
 // Of the annotations to which a found tree is the nearest one, the nearest that states something belongs to it; the others belong to none.
-// An annotation reaches no tree that was another one when it was made.
+// A rejection reaches no tree that was another one when it was made (`reach_of` in app/batch/run_edits.py).
 const pairs = { map: null, annotations: null, ofTree: new Map(), treeOf: new Map() };
 
 function paired() {
@@ -515,9 +515,9 @@ export function answerText() {
 }
 
 // The answer that this one replaced, with the name of another person.
-function replacedText({ before, kind, isStored }) {
-  if (isStored || !before || [SKIPPED, kind].includes(before.kind)) return "";
-  return ` (before: ${before.kind}${byOther(before)})`;
+function replacedText({ before, kind, dbh, isStored }) {
+  const isOther = before && (before.kind !== kind || (before.dbh_cm !== null && before.dbh_cm !== dbh));
+  return isStored || !isOther || before.kind === SKIPPED ? "" : ` (before: ${statement(before.kind, before.dbh_cm)}${byOther(before)})`;
 }
 
 export const byOther = (row) => (row.who === myName() ? "" : ` by ${row.who}`);

@@ -119,7 +119,7 @@ function takeDbh({ target }) {
 // Returns whether a doubtful DBH is to be confirmed by a second Enter.
 function isQuestioned(input, tree) {
   const dbh = checkedDbh(input), doubt = tree && dbh !== undefined ? typedDoubt(tree, dbh) : "";
-  if (!doubt || input.dataset.asked === input.value) return false;
+  if (!doubt || input.dataset.asked === input.value || dbh === annotationOf(tree)?.dbh_cm) return false;
   input.dataset.asked = input.value;
   input.setAttribute("aria-invalid", "true");
   setText(byId("review-dbh-error"), `${doubt} Press Enter again to store ${dbh} cm, Escape to restore it.`);

@@ -15,7 +15,7 @@ import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answerBeside, answeredTrees, answerText, byClick, byOther, callMe, change, choose, contradicting, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, unreviewed, votesText, withoutTree } from "./annotations.js";
+import { annotating, annotationOf, answerBeside, answeredTrees, answerText, byClick, byOther, callMe, change, choose, contradicting, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, typedDoubt, unreviewed, votesText, withoutTree } from "./annotations.js";
 import { card, fillCard, moreEvidence, startCard, typeDbh } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -141,9 +141,16 @@ function openCard(row, target) {
   if (!target.matches("input, select")) showCard();
 }
 
+// A doubtful DBH is stored when it is typed a second time.
 function takeDbh(line, input) {
-  const dbh = typedDbh(input.value);
-  return dbh === undefined ? null : change(line.row, { dbh_cm: dbh });
+  const dbh = typedDbh(input.value), tree = treeOf(treeNumberOf(line.row));
+  if (dbh === undefined) return null;
+  const doubt = tree && input.dataset.asked !== String(dbh) ? typedDoubt(tree, dbh) : "";
+  input.dataset.asked = doubt ? String(dbh) : "";
+  if (!doubt) return change(line.row, { dbh_cm: dbh });
+  input.value = line.row.dbh_cm === null ? "" : String(line.row.dbh_cm);
+  draft.error = `The DBH ${dbh} cm of tree ${tree.number} was not stored. ${doubt} Type it again to store it.`;
+  return fill();
 }
 
 function show(line, row) {

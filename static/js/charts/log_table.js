@@ -9,15 +9,16 @@ export const lasts = (event) => event.for_s !== undefined;
 const dateOf = (seconds) => (seconds > OLDEST ? new Date(1000 * seconds) : null);
 const byRobot = ({ t }, start) => (start > OLDEST ? dateOf(start + t) : null);
 const byComputer = ({ noted_s: noted }, isLive) => (isLive ? dateOf(noted) : null); // of a recording nothing happens now
-const duration = (event) => (!lasts(event) ? "" : event.for_s === null ? "lasts" : `${figure(event.for_s)} s`);
+const duration = (event, unended) => (!lasts(event) ? "" : event.for_s === null ? unended : `${figure(event.for_s)} s`);
 const timeCell = (date) => el("td", { class: "clock", text: date?.toLocaleTimeString("sv-SE") ?? "", title: date?.toLocaleString("sv-SE") ?? "" });
 
-// `start` is the time of the first scan by the robot's clock [s since 1970], `timeOf` the content of the cell of a time.
-export function logTable(events, start, isLive, timeOf = clock) {
+// `start` is the time of the first scan by the robot's clock [s since 1970], `timeOf` the content of the cell of a time, `unended`
+// the duration of what has no end yet.
+export function logTable(events, start, isLive, timeOf = clock, unended = "lasts") {
   const titles = [["run"], ...(isLive ? [["computer's clock", "clock"]] : []), ["robot's clock", "clock"], ["lasted", "lasted"], ["what"]];
   const rows = [...events].reverse().map((event) => el("tr", {},
     el("td", {}, timeOf(event.t)), ...(isLive ? [timeCell(byComputer(event, isLive))] : []), timeCell(byRobot(event, start)),
-    el("td", { class: "figure lasted", text: duration(event) }), el("td", { text: event.text })));
+    el("td", { class: "figure lasted", text: duration(event, unended) }), el("td", { text: event.text })));
   return el("table", {}, el("thead", {}, el("tr", {}, ...titles.map(([text, name]) => el("th", { scope: "col", class: name ?? "", text })))), el("tbody", {}, ...rows));
 }
 

@@ -108,17 +108,19 @@ function more(run, map) {
       ? table(["parameter", "value"], Object.entries(run.differences).map(([name, value]) => [name, String(value)]))
       : el("p", { class: "note", text: `None: all parameters are those of the preset ${run.preset}.` })),
     el("div", {}, el("h3", { text: "Changes of parameters" }), ...changes(run)),
-    ...(run.map.log ? [log(run.map.log, title)] : []),
+    ...(run.map.logs?.length ? [log(run.map.logs, title)] : []),
     el("details", {}, el("summary", { text: `All ${Object.keys(run.parameters).length} parameters` }),
       table(["parameter", "value"], Object.entries(run.parameters).map(([name, value]) => [name, String(value)]))));
 }
 
-// A live run cannot be replayed with the times of this computer's clock, so its log is kept.
-function log({ events: every, start_s: start }, title) {
-  const events = every.filter((event) => !event.before), shown = events.filter(lasts);
+// A live run cannot be replayed with the times of this computer's clock, so its logs are kept: one from each start of the mapper.
+function log(logs, title) {
+  const parts = logs.map(({ events, start_s: start }) => ({ start, events: events.filter((event) => !event.before) }));
+  const tables = parts.map(({ start, events }) => ({ start, shown: events.filter(lasts) })).filter(({ shown }) => shown.length);
+  const rows = parts.flatMap(({ start, events }, k) => logRows(events, start, true).slice(k ? 1 : 0)); // one header
   return el("div", { id: "run-log" }, el("h3", { text: "Log" }),
-    shown.length ? el("div", { class: "scroll" }, logTable(shown, start, true)) : el("p", { class: "note", text: "No obstacle ahead, no silence, and the pose was good." }),
-    el("button", { class: "small", text: "All events as CSV", onclick: () => saveCsv(fileName(title, `log${dayOf(events, start, true)}.csv`), logRows(events, start, true)) }));
+    ...(tables.length ? tables.map(({ start, shown }) => el("div", { class: "scroll" }, logTable(shown, start, true, clock, "until the end"))) : [el("p", { class: "note", text: "No obstacle ahead, no silence, and the pose was good." })]),
+    el("button", { class: "small", text: "All events as CSV", onclick: () => saveCsv(fileName(title, `log${dayOf(parts[0].events, parts[0].start, true)}.csv`), rows) }));
 }
 
 function changes({ revisions }) {

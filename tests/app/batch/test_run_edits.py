@@ -40,8 +40,13 @@ def test_the_nearest_annotation_decides(contents, reviews):
     assert reviews_of([], np.zeros((0, 2)), contents) == {}
 
 
-@given(st.floats(0.0, 1.2), st.floats(0.0, 0.4), st.sampled_from(["tree", "pole"]), st.floats(-np.pi, np.pi))
-def test_an_answer_never_passes_to_a_tree_that_was_a_neighbour(
+@given(
+    st.floats(0.0, 1.2),
+    st.floats(0.0, 0.4),
+    st.sampled_from(["bush", "pole", SKIPPED]),
+    st.floats(-np.pi, np.pi),
+)
+def test_a_rejection_never_passes_to_a_tree_that_was_a_neighbour(
     gap: float, off: float, kind: str, angle: float
 ):
     own = np.array([5.0, -3.0])
@@ -56,6 +61,14 @@ def test_an_answer_never_passes_to_a_tree_that_was_a_neighbour(
     # An isolated tree that moves is the same one.
     assert reach_at(both[:1], (x, y)) is None
     assert reach_at(np.zeros((0, 2)), (0.0, 0.0)) is None
+
+
+def test_a_confirmation_holds_for_the_copy_that_a_later_map_has():
+    copies = np.array([[0.0, 0.0], [0.3, 0.0]])
+    answer = Content(0.0, 0.0, "tree", 0.3, reach=reach_at(copies, (0.0, 0.0)))
+    later = np.array([[0.15, 0.0]])
+    assert reviews_of([1], later, [answer]) == {1: "confirmed"}
+    assert not len(measured_by_people([1], later, [answer]).added)
 
 
 def test_the_nearest_tape_counts_and_what_belongs_to_no_tree_is_added():

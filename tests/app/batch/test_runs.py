@@ -144,16 +144,24 @@ async def test_a_live_run_keeps_its_log(both: Running) -> None:
     await dashboard.receive(Report(live))
     await dashboard.receive(Report(replace(live, state="waiting", detail="no data for 2 s", time_s=0.2)))
     await show(dashboard, 8, 4)
+    # The worker is started again: what happened before stays.
+    opened_again = replace(live, state="waiting", detail="no data for 5 s", time_s=0.4)
+    dashboard.worker.restarts += 1
+    await dashboard.receive(opened(LIVE, truth=TRUTH))
+    await show(dashboard, 9, 4)
+    await dashboard.receive(Report(opened_again))
     await play(dashboard, "fake:", run=2)
     await dashboard.run_recorder.close()
     logs = {}
     for row in await runs(client):
-        logs[row["uri"]] = (await client.get(f"/api/runs/{row['key']}")).json()["map"]["log"]
-    assert logs["fake:"] is None  # it can be replayed
-    silence = next(event for event in logs[LIVE]["events"] if event["kind"] == "silence")
+        logs[row["uri"]] = (await client.get(f"/api/runs/{row['key']}")).json()["map"]["logs"]
+    assert logs["fake:"] == []  # it can be replayed
+    first, second = logs[LIVE]
+    silence = next(event for event in first["events"] if event["kind"] == "silence")
     assert (silence["text"], silence["for_s"]) == ("no data for 2 s", 0.6)
     assert silence["noted_s"] > 1e9
-    assert logs[LIVE]["start_s"] == dashboard.start_ns / 1e9
+    assert first["start_s"] == dashboard.start_ns / 1e9
+    assert [each["text"] for each in second["events"] if each["kind"] == "silence"] == ["no data for 5 s"]
 
 
 async def test_a_run_that_showed_nothing_leaves_no_record(both: Running) -> None:

@@ -18,8 +18,17 @@ import pytest_asyncio
 from websockets.asyncio.client import connect
 from websockets.typing import Origin
 
+from app.batch.run_edits import SAME_THING
 from app.common.settings import Settings
-from app.dashboard.annotations import AnnotationEditor, _successors, counted, laid_over, truth_of
+from app.dashboard.annotations import (
+    AnnotationEditor,
+    _successors,
+    carried_by,
+    counted,
+    import_plan,
+    laid_over,
+    truth_of,
+)
 from app.dashboard.dashboard import Dashboard
 from app.store.async_store import LARGEST_QUEUE, AsyncStore, StoreBusyError
 from app.store.records import Annotation, Content, contents_of
@@ -28,6 +37,7 @@ from app.web.routes.annotations import _imported, _ImportTable
 from app.worker.protocol import Shown
 from pipeline.geometry.columns import rows_of
 from pipeline.io.ground_truth import parse_truth_trees
+from pipeline.repairs.record import Repair
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, ENDS, TOKEN, Running, running, served
@@ -535,3 +545,41 @@ def test_merged_trees_of_a_repaired_path_are_found_by_those_that_were_seen_with_
     after = rows_of(before, np.array([0, 1, 2, 6]))
     after.position[3] = (18.0, 0.0)
     assert _successors(before, after, (2, 5)) == {1: 1, 2: 2, 3: 3, 7: 7, 5: 2, 4: 1, 6: 3}
+
+
+def test_a_rejection_of_a_vanished_tree_neither_follows_nor_decides_a_merge() -> None:
+    there = trees(np.array([[0.3, 0.0], [0.9, 0.0]]))
+    gone = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", 0, 1)
+    confirmed = Annotation(2, Content(0.9, 0.0, "tree", 0.31), "Ben", 0, 1)
+    places = ((0.3, 0.0), (0.9, 0.0))
+    changes = carried_by(there, [gone, confirmed], [Repair("merge", places)])
+    assert [(id_, content is None) for id_, _, content in changes] in ([], [(2, False)])
+
+
+@pytest.mark.parametrize("replaces", [False, True])
+def test_a_table_changes_only_what_its_rows_are_about(replaces: bool) -> None:
+    rejected = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", 0, 1)
+    plan = import_plan([rejected], [Content(0.3, 0.0, "tree", 0.31)], replaces=replaces)
+    assert (len(plan.added), plan.replaced, plan.conflicts) == (1, [], [])
+    open_ = Annotation(2, Content(5.0, 0.0), "Ann", 0, 1)
+    twice = [Content(5.0, 0.0, "tree", 0.3), Content(5.0, 0.0, "tree", 0.5)]
+    plan = import_plan([open_], twice, replaces=replaces)
+    assert [content and content.dbh for *_, content in plan.filled] == [0.3]
+    assert (plan.replaced, len(plan.conflicts)) == ([], 1)
+
+
+async def test_the_reach_is_that_of_the_map_in_which_an_answer_was_given(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    assert dashboard.shown is not None
+    (x, y), (other_x, other_y), *_ = dashboard.shown.frame.trees.position.tolist()
+    gap = float(np.hypot(other_x - x, other_y - y))
+    number = (await edit(client, "POST", x=x, y=y, kind="pole")).json()["id"]
+    stored = dashboard.annotation_editor.rows[0]
+    assert stored.content.reach == (pytest.approx(gap / 2.0) if gap < 2.0 * SAME_THING else None)
+    # The trees move away: the answer is about none, so that a nudge gives it no other one.
+    dashboard.annotation_editor.rows[0] = replace(stored, content=replace(stored.content, reach=0.1))
+    dashboard.shown.frame.trees.position[0] += 0.3
+    said = {"x": x + 0.01, "y": y, "kind": "pole", "version": stored.version}
+    assert (await edit(client, "PATCH", f"/{number}", **said)).status_code == 200
+    assert dashboard.annotation_editor.rows[0].content.reach == 0.1

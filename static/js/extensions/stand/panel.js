@@ -202,12 +202,12 @@ function hint() {
   if (drawing()) return `Drag on the map from ${sketch.kind === "circle" ? "the centre outwards" : "corner to corner"}, or click both ends. Esc ends.${sketch.kind === "circle" ? " Then its radius can be typed in the list." : ""}`;
   if (!state.map) return nothingYet();
   const drawn = plots().length > 0;
-  const { trees_in_map: found, trees_added: added, trees_left_out: leftOut = {}, added_out_of_sight: unseen = [] } = (drawn ? figures.plots : figures.all) ?? {};
+  const { trees_in_map: found, trees_added: added, trees_left_out: leftOut = {}, added_out_of_sight: unseen = [], parameters } = (drawn ? figures.plots : figures.all) ?? {};
   const all = found + added;
   const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
   const trees = found === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${count(all, "tree")} are counted.`}${outOfSightText(unseen)}`;
   if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
-  return `Trees of the map at the shown time.${trees} ± is the standard error, with 6 % of the stems for false and missed trees, less for trees that people confirmed. For the mean it is the variation between plots, at least the error of the plots.`;
+  return `Trees of the map at the shown time.${trees} ± is the standard error${parameters ? `, with ${figure(100 * parameters.count_error)} % of the stems for false and missed trees, less for trees that people confirmed` : ""}. For the mean it is the variation between plots, at least the error of the plots, and the error of false and missed trees, which all plots share.`;
 }
 
 function outOfSightText(places) {

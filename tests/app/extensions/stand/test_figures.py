@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.extensions.stand.figures import PlotTrees, combined, compared_with_gaps, stand_figures
+from app.extensions.stand.figures import MISSED, PlotTrees, combined, compared_with_gaps, stand_figures
 from app.extensions.stand.parameters import Stand
 
 EXACT_COUNT = Stand(count_error=0.0)
@@ -309,6 +309,16 @@ def test_diameters_by_tape_share_no_error():
     assert near[1].values["n_ha"].se < 0.5 * near[0].values["n_ha"].se
 
 
+def test_an_error_that_a_plot_does_not_know_is_not_known_of_the_mean():
+    """Half of the trees have no diameter: which half is not known, so the mean has the same bias."""
+    known = figures(trees_of([0.1, 0.3] * 20))
+    unknown = figures(trees_of([0.1, math.nan] * 20))
+    assert math.isnan(unknown.values["g_ha"].se)
+    assert math.isnan(combined({"a": known, "b": unknown})["g_ha"].se)
+    assert math.isfinite(combined({"a": known, "b": unknown})["n_ha"].se)
+    assert math.isfinite(combined({"a": known, "b": known})["g_ha"].se)
+
+
 def test_a_plot_in_full_view_has_the_counting_error_in_each_figure_of_stems():
     wrong, exact = (
         figures(trees_of([0.1, 0.3] * 20), detection=(1.0, math.nan), limits=limits)
@@ -318,7 +328,7 @@ def test_a_plot_in_full_view_has_the_counting_error_in_each_figure_of_stems():
         assert wrong.values[name].se == pytest.approx(0.06 * wrong.values[name].value), name
     for name in ("dg_cm", "mean_dbh_cm", "dominant_dbh_cm", "nearest_neighbour_m", "clark_evans"):
         np.testing.assert_equal(wrong.values[name], exact.values[name])
-    assert [c.n_ha.se for c in wrong.classes if c.trees] == pytest.approx([0.06 * 200.0] * 2)
+    assert [c.n_ha.se for c in wrong.classes if c.trees] == pytest.approx([MISSED * 200.0] * 2)
     with_view = figures(trees_of([0.2] * 40), seen=900.0, limits=Stand(count_error=0.06)).values["n_ha"]
     without = figures(trees_of([0.2] * 40), seen=900.0).values["n_ha"]
     assert with_view.se == pytest.approx(math.hypot(without.se, 0.06 * with_view.value))
@@ -526,6 +536,15 @@ def test_few_heights_are_a_warning_with_their_number_and_have_no_error():
         assert ("errors are not known" in text) != is_known
         assert f.values["lorey_height_m"].value == pytest.approx(20.0)
         assert math.isfinite(f.values["lorey_height_m"].se) == is_known
+
+
+def test_lorey_needs_heights_and_diameters_of_the_same_trees():
+    """Of the trees, 14 % have no height and 14 % others no diameter: 28 % lack a measurement for it."""
+    dbh = np.where(np.arange(50) < 7, np.nan, 0.3)
+    height = np.where((np.arange(50) >= 7) & (np.arange(50) < 14), np.nan, 20.0)
+    values = figures(with_heights(trees_of(dbh), height, 0.5)).values
+    assert math.isfinite(values["mean_height_m"].se)
+    assert math.isnan(values["lorey_height_m"].se)
 
 
 def test_plain_figures_of_several_plots_refer_to_their_whole_area():
