@@ -23,6 +23,7 @@ _MOST = 400
 #: Count at the end of a warning, such as "scans lost on the network (3)".
 _COUNT = re.compile(r" \(\d+[^()]*\)$")
 _LONGEST = 300
+_SINCE = re.compile(r"^Nothing heard for \d+ s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +167,8 @@ class Events:
             why: The reason.
             time_s: Time of the last scan [s since the first scan].
         """
-        if not self._turn("silence", True, time_s, why[:_LONGEST]):
+        text = _SINCE.sub("Nothing heard", why)  # the event has its own duration
+        if not self._turn("silence", True, time_s, text[:_LONGEST]):
             return False
         self._silent_since = time_s
         self._lasting -= {"stop", "slow"}

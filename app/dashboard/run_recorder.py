@@ -304,8 +304,8 @@ def _figures_of(
 ) -> RunFigures:
     """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
     (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth), in the
-    coordinates of the files, which are those of the map plus `offset`; `recordings`, see `ShownRun`; and
-    `logs`.
+    coordinates of the files, which are those of the map plus `offset`; `recordings` and `warnings`, see
+    `ShownRun`; and `logs`.
 
     Args:
         state, scores: The state, and its scores; None if there are none.
@@ -332,6 +332,7 @@ def _figures_of(
             "offset": list(state.offset[:2]),
             "recordings": list(state.recordings),
             "logs": list(logs),
+            "warnings": state.warnings(),
         },
     )
 

@@ -262,6 +262,24 @@ class ShownRun:
             **self._counts(scores),
         }
 
+    def warnings(self, *of_scores: str) -> list[str]:
+        """Return the warnings of run.json in their order; those of the status if the counts are unknown.
+
+        Args:
+            of_scores: Warnings about the scores of a drive.
+        """
+        counts = self.shown.counts
+        if counts is None:
+            return list(self.status.warnings)
+        warnings = list(counts.warnings)
+        if self.one_step is None:
+            warnings += of_scores
+            if unconfirmed := unconfirmed_warning(self.shown.frame, self.parameters):
+                warnings.append(unconfirmed)
+            if left_out := left_out_warning(counts.losses, self.shown.frame.index + 1):
+                warnings.append(left_out)
+        return warnings
+
     def _counts(self, scores: dict[str, Any] | None) -> dict[str, Any]:
         """Return a dict with `health` (not without a drive), `verdicts`, `losses` and `warnings` of
         run.json, as `stemmap map` writes them, but `health` has no spans and of the worst values at most
@@ -272,15 +290,9 @@ class ShownRun:
         """
         counts = self.shown.counts
         if counts is None:
-            return {"warnings": list(self.status.warnings)}
-        warnings = list(counts.warnings)
-        if self.one_step is None:
-            if scores is not None and scores["TA"]["of"] + scores["TR"]["of"] == 0:
-                warnings.append(far_truth(scores["reach"]))
-            if unconfirmed := unconfirmed_warning(self.shown.frame, self.parameters):
-                warnings.append(unconfirmed)
-            if left_out := left_out_warning(counts.losses, self.shown.frame.index + 1):
-                warnings.append(left_out)
+            return {"warnings": self.warnings()}
+        is_far = scores is not None and scores["TA"]["of"] + scores["TR"]["of"] == 0
+        warnings = self.warnings(*([far_truth(scores["reach"])] if scores is not None and is_far else []))
         worst = {} if counts.sigma_xy_m is None else {"sigma_xy_m": counts.sigma_xy_m}
         return {
             **({"health": {"scans": counts.health, "worst": worst}} if counts.health else {}),

@@ -14,10 +14,12 @@ from app.robot.zenoh import ADMIN, PUBLISHER, data_key
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.container import Channel
 from pipeline.io.readers.mcap_file import McapFile
+from pipeline.io.readers.topics import is_fixed
 
 _MSGTYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
 _HASH = "RIHS01_0"  # of the message types; stemmap does not compare it
 _POLL_S = 0.1
+_FIXED = 100  # messages of a topic of fixed transforms
 _OTHERS_S = 0.5  # until the other topics are subscribed to as well
 
 
@@ -34,6 +36,7 @@ def send(file: Path, port: int) -> int:
         StemmapError: The port cannot be used.
     """
     import zenoh
+    from zenoh import ext
 
     settings = {
         "mode": "router",
@@ -57,18 +60,26 @@ def send(file: Path, port: int) -> int:
             ) from None
         with session:
             tokens = []
-            publishers: dict[int, Any] = {}  # zenoh declares the type of `matching_status` wrongly
+            publishers: dict[int, Any] = {}
+            listeners: list[Any] = []  # zenoh declares the type of `matching_status` wrongly
             for number, channel in channels.items():
                 key = data_key(0, channel.topic, channel.msgtype, _HASH)
                 node = f"{ADMIN}/0/{session.info.zid()}/0/{number}/{PUBLISHER}/%/%/driver"
                 topic = f"{channel.topic.replace('/', '%')}/{key.split('/')[-2]}/{_HASH}/::,10:,:,:,,"
                 tokens.append(session.liveliness().declare_token(f"{node}/{topic}"))
-                publishers[number] = session.declare_publisher(
-                    key, congestion_control=zenoh.CongestionControl.BLOCK
+                publishers[number] = ext.declare_advanced_publisher(
+                    session,
+                    key,
+                    congestion_control=zenoh.CongestionControl.BLOCK,
+                    # Fixed transforms are sent once; who subscribes later gets them too, as from a robot.
+                    cache=ext.CacheConfig(_FIXED) if is_fixed(channel.topic) else None,
+                    publisher_detection=is_fixed(channel.topic),
                 )
+                if number in scans:
+                    listeners.append(session.declare_publisher(key))
             address = f"zenoh:tcp/127.0.0.1:{port}"
             print(f"The robot waits. Open it with: uv run stemmap {address}", flush=True)  # noqa: T201
-            while not any(publishers[number].matching_status.matching for number in scans):
+            while not any(listener.matching_status.matching for listener in listeners):
                 time.sleep(_POLL_S)
             time.sleep(_OTHERS_S)
             begun, first_ns, sent = time.monotonic(), None, 0

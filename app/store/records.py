@@ -157,7 +157,7 @@ class RunFigures:
         parameters: Dict from the dotted name of each parameter to its value.
         scores: Result of `score_payload`, or None.
         map: Dict with `trees`, `path`, `truth` and, of a live run, `recordings` and `logs`, lists of JSON
-            values.
+            values; and `warnings`.
     """
 
     scans: int

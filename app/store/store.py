@@ -712,21 +712,21 @@ class Store:
             "made_before": row.made_by,
         }
         change = _inserted(connection, insert(_changes).values(**values))
-        self._put(connection, author, row, values["after"], change)
+        self._put(connection, author.who, row, values["after"], change)
 
     def _put(
-        self, connection: Connection, author: Author, row: Row[Any], content: dict[str, Any] | None, by: int
+        self, connection: Connection, who: str, row: Row[Any], content: dict[str, Any] | None, by: int
     ) -> None:
         """Set the current content of an annotation.
 
         Args:
             connection: Connection with an open transaction.
-            author: Author of the edit.
+            who: Name of the author of the content.
             row: Present row of the annotation.
             content: New content; None deletes the annotation.
             by: Number of the change that led to the content.
         """
-        edit = {"who": author.who, "at_ns": self._clock(), "version": row.version + 1, "made_by": by}
+        edit = {"who": who, "at_ns": self._clock(), "version": row.version + 1, "made_by": by}
         connection.execute(
             update(_annotations)
             .where(_annotations.c.id == row.id)
@@ -765,7 +765,8 @@ class Store:
             connection.execute(update(_steps).where(_steps.c.id == step).values(state=state))
             for change, row in () if stale is not None else pairs:
                 content, by = (change.before, change.made_before) if back else (change.after, change.id)
-                self._put(connection, author, row, content, by)
+                who = None if content is None else _author_of(connection, by)
+                self._put(connection, who or author.who, row, content, by)
         if own:
             raise StaleError(
                 "a later edit of yours changed the same annotation", remedy="Undo that edit first, in its tab"
@@ -902,6 +903,12 @@ def _inserted(connection: Connection, statement: Insert) -> int:
     return int(key[0])
 
 
+def _author_of(connection: Connection, change: int) -> str | None:
+    """Return the name of the author of a change; None for the number of no change."""
+    steps = select(_steps.c.who).join(_changes, _changes.c.step == _steps.c.id)
+    return connection.execute(steps.where(_changes.c.id == change)).scalar()
+
+
 def _is_of_a_later_step(connection: Connection, row: Row[Any], author: Author) -> bool:
     """Return whether the present content of an annotation is that of an edit of this browser that was not
     undone."""
@@ -919,6 +926,7 @@ def _stale(row: Row[Any]) -> StaleError:
     present row."""
     done = "deleted" if row.deleted else "changed"
     return StaleError(
-        f"annotation {row.id} was {done} by {row.who} at {moment(row.at_ns)}",
+        f"the annotation ({row.kind}) at {row.x:.2f}, {row.y:.2f} was {done} by {row.who} "
+        f"at {moment(row.at_ns)}",
         remedy="Your edit was not saved; check the current state and try again",
     )

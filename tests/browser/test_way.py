@@ -144,6 +144,20 @@ ENDED_RUN = """async () => {
   state.status = { ...state.status, state: 'finished' };
   changed('status');
 }"""
+# One whose robot does not know where it is; `zone` is that of an obstacle.
+LOST = """async (zone) => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const health = { ...state.map.health, state: 'lost', reason: 'the known trees are not found' };
+  const clearance = zone && { ...state.map.clearance, zone, ahead_m: 0.8 };
+  state.status = { ...state.status, live: true, state: 'playing', health: 'lost', detail: '' };
+  state.map = { ...state.map, health, clearance };
+  state.statusAt = state.heardAt = performance.now();
+  changed('map');
+  changed('status');
+  const way = document.querySelector('#way');
+  const { isLost } = await import('/static/js/shell/status.js');
+  return [way.hidden ? '' : way.innerText, way.dataset.zone, isLost()];
+}"""
 # One that waits for its first scan.
 UNHEARD = """async () => {
   const { state, changed } = await import('/static/js/core/store.js');
@@ -384,6 +398,24 @@ def test_a_warning_of_a_live_run_tells_once_that_sound_is_off(dashboard: Dashboa
     page.evaluate("() => localStorage.removeItem('stemmap.alarm-sound')")
     page.evaluate(SILENT, 2)
     expect(hint).to_be_hidden()  # not yet as loud as a stop
+    page.evaluate(REAL_STATUS)
+    page.reload()
+
+
+def test_a_lost_pose_of_a_robot_is_reported_below_a_stop(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    page.evaluate(STAYS)
+    text, zone, is_lost = page.evaluate(LOST, None)
+    assert "Pose lost" in text
+    assert "The known trees are not found" in text
+    assert (zone, is_lost) == ("lost", True)
+    text, zone, is_lost = page.evaluate(LOST, "stop")
+    assert "Stop: obstacle" in text
+    assert (zone, is_lost) == ("stop", False)
+    assert "Pose lost" in page.evaluate(LOST, "slow")[0]
+    page.evaluate(ENDED_RUN)
+    expect(page.locator("#way")).to_be_hidden()
     page.evaluate(REAL_STATUS)
     page.reload()
 

@@ -6,10 +6,12 @@ import asyncio
 import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
 from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
@@ -17,17 +19,30 @@ from starlette.responses import Response
 from app.batch.run_edits import SAME_THING, annotation_of_tree, reach_at
 from app.dashboard.annotations import Against, carried_back, import_plan, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.store.records import MOST_ANNOTATIONS, REPAIR, SKIPPED, Author, Content, contents_of, moment
+from app.store.records import (
+    KINDS,
+    MOST_ANNOTATIONS,
+    REPAIR,
+    SKIPPED,
+    Annotation,
+    Author,
+    Content,
+    StaleError,
+    contents_of,
+    moment,
+)
 from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
 from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
 from pipeline.errors import SourceError
 from pipeline.repairs.record import Repair
+from pipeline.types.records import Trees
 
 router = APIRouter(prefix="/api")
 
 _LARGEST_DBH_M = 10.0
 _SAME_PLACE_M = 0.001  # the page states places to 0.1 mm
+_AT_TREE_M = 0.1  # an answer is given at the tree, which moves in a live map until it arrives
 _MOST_NAMED = 3  # contradictions of an import that are named
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
 
@@ -88,9 +103,22 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
     """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
     and not exported); return its number (`id`) and the counts of edits, see `edited`, with 201. 409 if
-    another run was opened meanwhile, nothing can be annotated, or the run has MOST_ANNOTATIONS."""
+    another run was opened meanwhile, nothing can be annotated, the tree there has an annotation that states a
+    class, or the run has MOST_ANNOTATIONS."""
     content = replace(body.content, reach=_reach_at(dashboard, body.x, body.y))
-    (added,) = await apply_edit(dashboard, body, Store.add, [content])
+    trees = None if dashboard.shown is None else dashboard.shown.frame.trees
+
+    def add_first(store: Store, run: int, author: Author) -> int:
+        known = [row for row in store.annotations(run) if row.content.kind in (*KINDS, SKIPPED)]
+        other = None if trees is None else _answer_before(trees, known, content)
+        if other is not None:
+            raise StaleError(
+                f"this tree was annotated by {other.who} meanwhile ({other.content.kind})",
+                remedy="Your answer was not saved; answer again to replace it",
+            )
+        return store.add(run, author, [content])[0]
+
+    added = await apply_edit(dashboard, body, add_first)
     return await edited(dashboard, body, {"id": added}, 201)
 
 
@@ -98,7 +126,7 @@ async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
 async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Response:
     """Change an annotation; 409 if it does not have this version any more or another run was opened, 404 for
     an unknown one. Return its number (`id`) and the counts of edits, see `edited`."""
-    content = replace(body.content, reach=_reach_after(dashboard, number, body))
+    content = replace(body.content, reach=await asyncio.to_thread(_reach_after, dashboard, number, body))
     await apply_edit(dashboard, body, Store.change, number, body.version, content)
     return await edited(dashboard, body, {"id": number})
 
@@ -221,6 +249,24 @@ def _reach_at(dashboard: Dashboard, x: float, y: float) -> float | None:
         return None
     trees = dashboard.shown.frame.trees
     return reach_at(trees.position[trees.confirmed], (x, y))
+
+
+def _answer_before(trees: Trees, known: Sequence[Annotation], content: Content) -> Annotation | None:
+    """Return the annotation of the tree at whose place a new one is made, if it states a class or both are
+    skips; None if there is none. Two people may answer for one tree at the same moment.
+
+    Args:
+        trees: Trees of the shown map.
+        known: The annotations of objects and skipped trees.
+        content: The new annotation.
+    """
+    position = trees.position[trees.confirmed]
+    away = np.hypot(*(position - (content.x, content.y)).T)
+    if not len(away) or away.min() >= _AT_TREE_M:
+        return None
+    row = annotation_of_tree(position, [each.content for each in known]).get(int(away.argmin()))
+    other = None if row is None else known[row]
+    return None if other and other.content.kind == SKIPPED != content.kind else other
 
 
 def _reach_after(dashboard: Dashboard, number: int, body: _AnnotationChange) -> float | None:

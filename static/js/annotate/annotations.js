@@ -2,7 +2,7 @@
 
 import { get, put, request } from "../core/api.js";
 import { byId, randomId, recall, remember } from "../core/dom.js";
-import { count, dbhFigure, share } from "../core/format.js";
+import { capital, count, dbhFigure, share } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { attempted, showNews } from "../core/problem.js";
@@ -495,6 +495,17 @@ export function answeredTrees() {
   return [...new Set([...stored, ...answering])].map(treeOf).filter(Boolean);
 }
 
+// Tells when another person has replaced an answer of this window.
+let answers = new Map(); // of this window, by the id of the annotation
+function tellReplaced() {
+  const now = new Map(rows().filter((row) => draft.answered.includes(row.id)).map((row) => [row.id, row]));
+  for (const [id, row] of now) {
+    const was = answers.get(id), isOther = was && (was.kind !== row.kind || was.dbh_cm !== row.dbh_cm);
+    if (isOther && row.who !== myName()) showNews(`${capital(treeNumberOf(row) === null ? "your annotation" : `tree ${treeNumberOf(row)}`)}: ${statement(row.kind, row.dbh_cm)} by ${row.who}, in place of ${statement(was.kind, was.dbh_cm)}.`);
+  }
+  answers = now;
+}
+
 const answeredIn = (run) => JSON.parse(recall(`answered.${run}`, "sessionStorage") ?? "[]");
 
 function keepAnswered(id) {
@@ -621,6 +632,7 @@ export function startAnnotating() {
     }
     news();
   });
+  on("annotations", tellReplaced);
   on("annotations map selection", keepOneSelection);
   on("selection", forgetTreeBefore);
   on("others", noteOthers);

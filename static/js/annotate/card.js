@@ -120,6 +120,7 @@ function takeDbh({ target }) {
 function isQuestioned(input, tree) {
   const dbh = checkedDbh(input), doubt = tree && dbh !== undefined ? typedDoubt(tree, dbh) : "";
   if (!doubt || input.dataset.asked === input.value || dbh === annotationOf(tree)?.dbh_cm) return false;
+  draft.error = "";
   input.dataset.asked = input.value;
   input.setAttribute("aria-invalid", "true");
   setText(byId("review-dbh-error"), `${doubt} Press Enter again to store ${dbh} cm, Escape to restore it.`);

@@ -6,7 +6,7 @@ import { fileName } from "../core/download.js";
 import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance } from "../core/nearest.js";
-import { showNews } from "../core/problem.js";
+import { showNews, showProblem } from "../core/problem.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { historyKey } from "../core/undo_keys.js";
@@ -110,6 +110,7 @@ async function take(file, unit, replaces) {
   const more = confirmed() - before;
   if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
   if (done) showNews(imported);
+  else showProblem(draft.error); // the button is below the list, the error above it
   fill();
 }
 
@@ -128,11 +129,20 @@ function besideText({ beside, beside_m: [least, most] }) {
 function lineOf(row) {
   const kind = el("select", { "aria-label": `Class of annotation ${row.id}`, onchange: () => change(line.row, { kind: kind.value }) },
     ...KINDS.map((each) => el("option", { value: each, text: each })));
-  const dbh = el("input", { type: "text", inputmode: "decimal", "aria-label": `DBH of annotation ${row.id} in cm`, placeholder: "–", onchange: () => takeDbh(line, dbh) });
+  const dbh = el("input", { type: "text", inputmode: "decimal", "aria-label": `DBH of annotation ${row.id} in cm`, placeholder: "–", onchange: () => takeDbh(line, dbh), onkeydown: ({ key }) => { if (key === "Enter") dbh.blur(); } });
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete annotation ${row.id}`, onclick: (event) => { event.stopPropagation(); remove(line.row); } });
   const cells = [el("td"), el("td", {}, kind), el("td", {}, dbh), el("td"), el("td"), el("td", { class: "annotate-who" }), el("td", {}, gone)];
   const line = { row, kind, dbh, node: el("tr", { "data-annotation": row.id, onclick: ({ target }) => openCard(row, target) }, ...cells) };
   return line;
+}
+
+// Goes to the DBH of the chosen annotation if it belongs to no found tree; returns whether it does not.
+function typeChosenDbh() {
+  const line = selectedTree() ? null : lines.get(draft.chosen);
+  if (!line) return false;
+  line.dbh.focus();
+  line.dbh.select();
+  return true;
 }
 
 // The row of an annotation opens the card of its tree; who edits in the row stays there.
@@ -317,7 +327,7 @@ function keyOfTab({ key, shiftKey }) {
   else if (shiftKey && key in CLASS_KEYS) review(CLASS_KEYS[key]);
   else if (key === "s") skip();
   else if (key === "r") previous();
-  else if (key === "d") typeDbh();
+  else if (key === "d") typeChosenDbh() || typeDbh();
   else if (key === "p" && draft.shown !== null) refusePlain(); // "Find a parameter" would leave the review
   else if (key === "Escape" && draft.adding) toggleAdding(false);
   else return false;

@@ -18,7 +18,8 @@ const isLive = () => Boolean(state.status?.live);
 
 export function showLog() {
   const kinds = [...new Set(state.events.map(({ kind }) => kind))].sort();
-  const box = byId("log"), key = JSON.stringify([filter, kinds, events(), state.eventsStart, isLive()]);
+  const hasEnded = state.status?.state === "finished";
+  const box = byId("log"), key = JSON.stringify([filter, kinds, events(), state.eventsStart, isLive(), hasEnded, Boolean(state.map)]);
   if (box.dataset.shown === key) return;
   box.dataset.shown = key;
   const isFocused = document.activeElement?.id === "log-kind";
@@ -30,8 +31,8 @@ export function showLog() {
   const canSeek = isDrive() && !isLive();
   const listed = events();
   box.replaceChildren(choice, listed.length
-    ? logTable(listed, state.eventsStart, isLive(), canSeek ? timeLink : undefined)
-    : el("p", { class: "empty", text: filter === LASTING ? "No obstacle ahead, no silence, and the pose was good." : "No such event." }));
+    ? logTable(listed, state.eventsStart, isLive(), canSeek ? timeLink : undefined, hasEnded ? "until the end" : undefined)
+    : el("p", { class: "empty", text: !state.map ? "Nothing is mapped yet." : filter === LASTING ? "No obstacle ahead, no silence, and the pose was good." : "No such event." }));
   if (isFocused) choice.focus();
 }
 

@@ -4,7 +4,7 @@ import { dayOf, lasts, logRows, logTable } from "../charts/log_table.js";
 import { get, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
-import { clock, count, figure, NONE } from "../core/format.js";
+import { capital, clock, count, figure, NONE } from "../core/format.js";
 import { confirmLeaving } from "../open/leaving.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";
@@ -109,6 +109,7 @@ function more(run, map) {
       : el("p", { class: "note", text: `None: all parameters are those of the preset ${run.preset}.` })),
     el("div", {}, el("h3", { text: "Changes of parameters" }), ...changes(run)),
     ...(run.map.logs?.length ? [log(run.map.logs, title)] : []),
+    ...(run.map.warnings?.length ? [el("div", { id: "run-warnings" }, el("h3", { text: "Warnings" }), el("ul", {}, ...run.map.warnings.map((text) => el("li", { text: capital(text) }))))] : []),
     el("details", {}, el("summary", { text: `All ${Object.keys(run.parameters).length} parameters` }),
       table(["parameter", "value"], Object.entries(run.parameters).map(([name, value]) => [name, String(value)]))));
 }

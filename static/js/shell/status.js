@@ -95,6 +95,8 @@ export const isSilent = () => {
   return silence !== null && isLoud(silence);
 };
 let held = { state: "good", reason: "", source: "", at: -Infinity };
+// Whether the line below the strip reports that a robot does not know where it is.
+export const isLost = () => byId("way").dataset.zone === "lost";
 
 function health({ health: word, state: phase, source }) {
   const silence = state.connected ? (isOld() ? noData(state.heardAt) : NO_DATA.test(word) && word) : state.lostAt && noData(state.lostAt);
@@ -243,7 +245,7 @@ function isOld() {
   return state.status?.state === "playing" && now - state.heardAt > patience;
 }
 
-// Obstacles ahead of the robot, or a silence of it, below the strip so that nothing moves. A screen reader announces changes of the
+// Obstacles ahead of the robot, a silence of it or a lost pose, below the strip so that nothing moves. A screen reader announces changes of the
 // zone, not of the distance or the duration.
 const way = byId("way");
 const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? Path ahead not visible to the sensor" };
@@ -253,16 +255,18 @@ function showWay() {
   // Only a robot that drives on has something in its way, and only a scan of now shows it.
   const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld()
     || (state.status?.live && state.status.state === "paused"); // the robot drives on
-  const text = silence ? `■ ${silence.what}` : clearance && !quiet && WAY[clearance.zone];
+  const obstacle = !silence && !quiet && WAY[clearance?.zone] ? clearance : null;
+  const isPoseLost = !silence && !quiet && state.status?.live && held.state === "lost" && obstacle?.zone !== "stop";
+  const text = silence ? `■ ${silence.what}` : isPoseLost ? "■ Pose lost" : obstacle && WAY[obstacle.zone];
   way.hidden = !text;
-  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : clearance?.zone ?? "";
-  showObstacle(text && !silence && state.map.obstacle ? { ...state.map.obstacle, zone: clearance.zone } : null);
+  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : isPoseLost ? "lost" : obstacle?.zone ?? "";
+  showObstacle(obstacle && state.map.obstacle ? { ...state.map.obstacle, zone: obstacle.zone } : null);
   const [zone, distance, why] = way.children;
   if (text) setText(zone, text);
-  setText(distance, silence ? ` for ${silence.for_s} s` : clearance && clearance.zone !== "unknown" ? ` ${figure(clearance.ahead_m)} m ahead` : "");
-  setText(why, silence ? silence.why : "");
+  setText(distance, silence ? ` for ${silence.for_s} s` : obstacle && !isPoseLost && obstacle.zone !== "unknown" ? ` ${figure(obstacle.ahead_m)} m ahead` : "");
+  setText(why, silence ? silence.why : isPoseLost ? capital(held.reason) : "");
   // Until a person of this browser has seen the setting.
-  byId("way-sound").hidden = !state.status?.live || !["stop", "silent"].includes(way.dataset.zone) || byId("alarm-sound").checked || recall("alarm-sound") !== null;
+  byId("way-sound").hidden = !state.status?.live || !["stop", "silent", "lost"].includes(way.dataset.zone) || byId("alarm-sound").checked || recall("alarm-sound") !== null;
   // An open dialog covers everything outside of it.
   const place = [...document.querySelectorAll("dialog:modal")].at(-1) ?? document.querySelector(".strip");
   if (way.parentElement !== place) place.append(way);

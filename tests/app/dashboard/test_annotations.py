@@ -150,7 +150,7 @@ async def test_a_stale_edit_is_refused_and_says_who_changed_it_when(both: Runnin
     for method, body in (("PATCH", {"x": 9.0, "y": 9.0}), ("DELETE", {})):
         refused = await edit(client, method, f"/{number}", version=1, **body)
         assert refused.status_code == 409
-        assert f"annotation {number} was changed by Bob at 20" in refused.json()["error"]["what"]
+        assert "(tree) at 0.50, 0.00 was changed by Bob at 20" in refused.json()["error"]["what"]
     assert [r["x"] for r in await rows(client)] == [0.5]
     # Ann's own step is no longer hers alone.
     assert (await edit(client, "POST", "/undo")).status_code == 409

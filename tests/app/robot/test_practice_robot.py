@@ -50,6 +50,25 @@ def test_a_run_is_sent_as_soon_as_somebody_listens(drive: Path, run: str):
         child.kill()
 
 
+@pytest.mark.slow
+def test_who_listens_later_gets_the_fixed_transforms_too():
+    port = free_port()
+    child = Child(
+        "-c", f"from app.cli import main; main(['send', 'sim:paper?duration=12', '--port', '{port}'])"
+    )
+    try:
+        child.hear()
+        heights = []
+        for _ in range(2):
+            with closing(listening(f"zenoh:tcp/127.0.0.1:{port}")) as source:
+                until(source.listen, source.waiting_for)
+                until(lambda source=source: bool(source.take()), source.waiting_for)
+                heights.append(source.description.T_base_lidar.t[2])
+        assert heights == [0.8, 0.8]
+    finally:
+        child.kill()
+
+
 def test_a_port_in_use_is_said(drive: Path, router: int):
     with pytest.raises(StemmapError, match=f"port {router} cannot be used"):
         send(drive, router)

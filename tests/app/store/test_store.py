@@ -317,6 +317,22 @@ def test_what_cannot_be_used_is_said_in_one_line_and_kept(tmp_path: Path, damage
     assert path.read_bytes() == before
 
 
+def test_what_an_undo_restores_is_of_who_made_it(tmp_path: Path):
+    with contextlib.closing(Store(tmp_path)) as store:
+        run = store.open_run("d", "u", "n")
+        (id_,) = store.add(run, ANN, [Content(0.0, 0.0)])
+        store.change(run, BOB, id_, 1, Content(0.0, 0.0, "pole"))
+        assert store.annotations(run)[0].who == BOB.who
+        store.undo(run, BOB)
+        (row,) = store.annotations(run)
+        assert (row.who, row.content.kind) == (ANN.who, "tree")
+        store.redo(run, BOB)
+        assert store.annotations(run)[0].who == BOB.who
+        store.undo(run, BOB)
+        store.undo(run, ANN)
+        assert store.annotations(run) == []
+
+
 def test_annotations_of_the_version_before_are_kept(tmp_path: Path):
     with contextlib.closing(Store(tmp_path)) as store:
         run = store.open_run("d", "u", "n")

@@ -132,6 +132,31 @@ async def test_of_two_edits_of_a_tree_at_once_one_is_taken_and_the_other_is_told
         assert sum(steps) == 1 + len(taken)
 
 
+async def test_of_two_answers_for_one_tree_at_once_one_is_taken_and_the_other_is_refused() -> None:
+    async with shared() as (_, dashboard, client):
+        assert dashboard.shown is not None
+        trees = dashboard.shown.frame.trees
+        places = trees.position[trees.confirmed].tolist()
+        for k, (x, y) in enumerate(places):
+            answers = [
+                edit(client, "POST", "", who, x=x + 0.02 * (who is BOB), y=y, kind=kind)
+                for who, kind in ((ANN, "tree"), (BOB, "pole"))
+            ]
+            taken = await asyncio.gather(*answers)
+            assert sorted(answer.status_code for answer in taken) == [201, 409]
+            refused = next(answer for answer in taken if answer.status_code == 409)
+            assert "this tree was annotated by" in refused.json()["error"]["what"]
+            stored = (await client.get("/api/annotations")).json()["trees"]
+            assert len(stored) == k + 1
+            assert stored[-1]["who"] in refused.text
+        # An answer replaces a skip, and a tree beside it is another object.
+        x, y = places[0]
+        (await edit(client, "DELETE", f"/{stored[0]['id']}", ANN, version=1)).raise_for_status()
+        (await edit(client, "POST", "", BOB, x=x, y=y, kind="skipped")).raise_for_status()
+        (await edit(client, "POST", "", ANN, x=x, y=y, kind="tree")).raise_for_status()
+        (await edit(client, "POST", "", ANN, x=x + 0.3, y=y, kind="tree")).raise_for_status()
+
+
 @pytest.mark.slow
 async def test_a_viewer_who_floods_loses_no_edit_of_the_owner_and_changes_nothing() -> None:
     async with (

@@ -42,7 +42,7 @@ function candidateFigures({ around }, known) {
 }
 
 export function treeEvidence({ extensions }) {
-  return extensions.clouds ? [sectionsFigure(extensions.clouds.sections)] : [];
+  return extensions.clouds ? [sectionsFigure(extensions.clouds.sections, byBreast)] : [];
 }
 
 function why(story, circles) {
@@ -65,9 +65,12 @@ function figures(story, stem) {
   seen ? "" : el("p", { class: "dim note", text: `Height not seen: ${stem.height_hidden}.` }));
 }
 
-// Pictures of the sections with points, highest first, all at one scale.
-function sectionsFigure(sections) {
-  const shown = sections.filter(({ points }) => points.length).reverse();
+const byHeight = (a, b) => b.height - a.height;
+const byBreast = (a, b) => Math.abs(a.height - BREAST) - Math.abs(b.height - BREAST);
+
+// Pictures of the sections with points, highest first unless another order is given, all at one scale.
+function sectionsFigure(sections, order = byHeight) {
+  const shown = sections.filter(({ points }) => points.length).sort(order);
   if (!shown.length) return "";
   const reach = Math.max(0.05, ...shown.map(({ radius, points }) => Math.max(radius ?? 0, ...points.map(([x, y]) => Math.hypot(x, y)))));
   return el("figure", { "data-sections": String(shown.length) }, el("figcaption", { text: "Cross-sections with the fitted circles; x of the map to the right" }),
