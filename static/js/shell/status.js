@@ -259,7 +259,7 @@ function showWay() {
   const isPoseLost = !silence && !quiet && state.status?.live && held.state === "lost" && obstacle?.zone !== "stop";
   const text = silence ? `■ ${silence.what}` : isPoseLost ? "■ Pose lost" : obstacle && WAY[obstacle.zone];
   way.hidden = !text;
-  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : isPoseLost ? "lost" : obstacle?.zone ?? "";
+  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : isPoseLost ? "lost" : clearance?.zone ?? "";
   showObstacle(obstacle && state.map.obstacle ? { ...state.map.obstacle, zone: obstacle.zone } : null);
   const [zone, distance, why] = way.children;
   if (text) setText(zone, text);
