@@ -403,6 +403,29 @@ def test_a_warning_of_a_live_run_tells_once_that_sound_is_off(dashboard: Dashboa
     page.reload()
 
 
+# A live run that a person has paused.
+PAUSED = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.status = { ...state.status, live: true, state: 'paused', health: 'good', silence_s: 23 };
+  state.statusAt = performance.now();
+  changed('status');
+  const way = document.querySelector('#way');
+  const { isSilent } = await import('/static/js/shell/status.js');
+  return [way.innerText, way.dataset.zone, isSilent(), document.body.classList.contains('stale')];
+}"""
+
+
+def test_a_paused_live_run_says_that_it_is_not_current_and_makes_no_sound(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    page.evaluate(STAYS)
+    text, zone, is_silent, is_stale = page.evaluate(PAUSED)
+    assert "Paused: not current for 23 s" in text
+    assert (zone, is_silent, is_stale) == ("slow", False, True)
+    page.evaluate(REAL_STATUS)
+    page.reload()
+
+
 def test_a_lost_pose_of_a_robot_is_reported_below_a_stop(dashboard: Dashboard):
     page = dashboard.page
     dashboard.stand(6.05)

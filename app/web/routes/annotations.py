@@ -43,6 +43,7 @@ router = APIRouter(prefix="/api")
 _LARGEST_DBH_M = 10.0
 _SAME_PLACE_M = 0.001  # the page states places to 0.1 mm
 _AT_TREE_M = 0.1  # an answer is given at the tree, which moves in a live map until it arrives
+_FEW_DIAMETERS = 3  # of a table and of the map, whose median tells the unit
 _MOST_NAMED = 3  # contradictions of an import that are named
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
 
@@ -111,10 +112,12 @@ async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
     def add_first(store: Store, run: int, author: Author) -> int:
         known = [row for row in store.annotations(run) if row.content.kind in (*KINDS, SKIPPED)]
         other = None if trees is None else _answer_before(trees, known, content)
+        if other is not None and (other.content.kind, None) == (content.kind, content.dbh):
+            return other.id  # both agree
         if other is not None:
             raise StaleError(
-                f"this tree was annotated by {other.who} meanwhile ({other.content.kind})",
-                remedy="Your answer was not saved; answer again to replace it",
+                f"it was annotated by {other.who} meanwhile ({other.content.kind})",
+                remedy="Your answer was not saved; select the tree again to replace it",
             )
         return store.add(run, author, [content])[0]
 
@@ -178,6 +181,8 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
     contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
+    if dashboard.shown is not None:
+        await asyncio.to_thread(_check_unit, dashboard.shown.frame.trees, contents)
     plan = import_plan(dashboard.annotation_editor.rows, contents, replaces=body.replaces)
     changed = [*plan.filled, *plan.replaced]
     added = [replace(each, reach=_reach_at(dashboard, each.x, each.y)) for each in plan.added]
@@ -342,6 +347,26 @@ def _check(content: Content, row: int) -> None:
     if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
         raise BadRequestError(
             f"row {row + 1} has a DBH of {content.dbh:.1f} m", remedy="Check the unit of the diameter"
+        )
+
+
+def _check_unit(trees: Trees, contents: list[Content]) -> None:
+    """Raise BadRequestError if the diameters of a table are in another unit than its header says: if the
+    median of their ratios to those of the map is nearer to 10 or to 1/10 than to 1.
+
+    Args:
+        trees: Trees of the shown map.
+        contents: The rows in the frame of the map.
+    """
+    position, mapped = trees.position[trees.confirmed], trees.dbh[trees.confirmed]
+    rows = annotation_of_tree(position, contents)
+    dbh = [(contents[k].dbh or np.nan) / mapped[row] for row, k in rows.items()]
+    ratios = np.array([ratio for ratio in dbh if np.isfinite(ratio)])
+    if len(ratios) >= _FEW_DIAMETERS and abs(np.log10(middle := float(np.median(ratios)))) > 0.5:
+        raise BadRequestError(
+            f"the diameters of the table are {middle:.2g} times those of the map, by the median of "
+            f"{len(ratios)} trees",
+            remedy="Check the unit of the diameter: the header names it, as dbh_cm or dbh_mm",
         )
 
 

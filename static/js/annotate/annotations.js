@@ -103,7 +103,7 @@ export function edit(work, answer = null) {
       await arrived(done.serial);
       return done;
     } catch (error) {
-      draft.error = error.message;
+      draft.error = answer ? `Tree ${answer.number}: ${error.message}` : error.message; // another card may be shown now
       if (draft.answer === answer) draft.answer = null; // not that of a later edit
       return null;
     } finally {
@@ -410,7 +410,7 @@ async function answer(tree, kind, fields = {}, goesOn = true) {
   const stored = edit(async () => {
     const row = annotationOf(tree); // after the edits before this one
     const isSeen = row && row.id === seen?.id && row.version === seen.version;
-    if (row && !isSeen && row.who !== myName()) throw new Error(`Tree ${number} was annotated by ${row.who} meanwhile; your answer was not stored.`);
+    if (row && !isSeen && row.who !== myName()) throw new Error(`it was annotated by ${row.who} meanwhile; your answer was not stored.`);
     return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind, ...fields } : { kind, ...fields })
       : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null, ...fields });
   }, given);
@@ -433,11 +433,11 @@ export function typedDbh(typed) {
   return undefined;
 }
 
-// Stores the DBH of a found tree [cm]. An open or skipped tree becomes confirmed; a rejected one stays rejected.
+// Stores the DBH of a found tree [cm], which confirms it; without one, its class stays.
 export function measureDbh(tree, dbh, goesOn) {
   const row = annotationOf(tree);
   if (row ? row.dbh_cm === dbh : dbh === null) return null;
-  return answer(tree, isReviewed(tree) ? row.kind : "tree", { dbh_cm: dbh }, goesOn);
+  return answer(tree, dbh === null ? row.kind : "tree", { dbh_cm: dbh }, goesOn);
 }
 
 // Whether Next marks the tree as skipped: an open one that no other page has selected.
@@ -510,6 +510,7 @@ const answeredIn = (run) => JSON.parse(recall(`answered.${run}`, "sessionStorage
 
 function keepAnswered(id) {
   draft.answered = [...draft.answered.filter((each) => each !== id), id].slice(-MOST_ANSWERED);
+  if (rowOf(id)) answers.set(id, rowOf(id)); // it has come before its number
   remember(`answered.${state.annotations.run}`, JSON.stringify(draft.answered), "sessionStorage");
 }
 

@@ -34,7 +34,7 @@ export const card = (answers, hint) => el("article", { id: "review", class: "rev
 
 // What else is known of the tree.
 export const moreEvidence = () => el("section", { id: "review-more", class: "review-more", "aria-label": "Further evidence on the tree" },
-  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, "DBH by tape in cm (D) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" })),
+  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, el("span", { id: "review-dbh-title" }), " ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" })),
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
@@ -173,6 +173,7 @@ function fillDbh(tree) {
   const input = byId("review-dbh"), isOther = input.dataset.tree !== String(tree.number);
   if (!isOther && (input === document.activeElement || input.getAttribute("aria-invalid") === "true")) return; // a person types
   input.dataset.tree = String(tree.number);
+  setText(byId("review-dbh-title"), `DBH by tape of tree ${tree.number} in cm (D)`);
   showDbh(tree);
   input.placeholder = tree.dbh_cm === null ? "" : `mapped ${figure(tree.dbh_cm)}`;
 }

@@ -6,7 +6,7 @@ import { fileName } from "../core/download.js";
 import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance } from "../core/nearest.js";
-import { showNews, showProblem } from "../core/problem.js";
+import { showDone, showNews, showProblem } from "../core/problem.js";
 import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { historyKey } from "../core/undo_keys.js";
@@ -72,7 +72,7 @@ function build() {
     el("div", { class: "annotate-files" },
       el("label", {}, "Name ", nameField("annotate-name")),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised. The rows are stored under your name", () => file.click()), unit,
-      el("label", { title: "For a table that was saved here and corrected elsewhere: its class and DBH replace those of the annotation at the same place. Otherwise rows that differ are left out and named" }, replaces, " replace what differs"), file,
+      el("label", { title: "For a table that was saved here and corrected elsewhere: its class and DBH replace those of the annotation at the same place; an empty DBH keeps the one here. Otherwise rows that differ are left out and named" }, replaces, " replace what differs"), file,
       truthLink("csv", "CSV"), truthLink("geojson", "GeoJSON")),
     ...ofExtensions("annotateSections"));
 }
@@ -109,7 +109,7 @@ async function take(file, unit, replaces) {
   const done = await importTable(await file.text(), unit, replaces);
   const more = confirmed() - before;
   if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
-  if (done) showNews(imported);
+  if (done) showDone(imported);
   else showProblem(draft.error); // the button is below the list, the error above it
   fill();
 }

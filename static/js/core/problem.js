@@ -14,6 +14,8 @@ function build() {
 }
 
 export const showProblem = (error) => show(typeof error === "string" ? error : error.message, true);
+// What a person did has worked: a problem of before does not hide it.
+export const showDone = (text) => show(text, false);
 export const showNews = (text) => { if (!box || box.hidden || !box.classList.contains("problem")) show(text, false); };
 
 function show(text, isProblem) {

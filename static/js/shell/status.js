@@ -85,11 +85,12 @@ function silenceOf(s) {
   if (!s?.live || s.scan_index < 0 || state.refused || [...NO_FIGURES, "finished"].includes(s.state)) return null;
   if (!state.connected) return state.lostAt ? { what: "No connection", for_s: seconds(state.lostAt), why: "The page reconnects by itself." } : null;
   if (isOld()) return { what: "No data", for_s: seconds(state.heardAt), why: "The program sends nothing." };
+  if (s.state === "paused") return { what: "Paused: not current", for_s: Math.floor(ageOf(s) ?? 0), why: "The robot may drive on; obstacles are not reported. Play returns to it.", isChosen: true };
   if (!NO_DATA.test(s.health)) return null;
   return { what: "No data", for_s: Math.floor(ageOf(s) ?? 0), why: capital(s.detail.replace(/^Nothing heard for \d+ s: /, "")) };
 }
 // Whether the line below the strip reports a silence as loudly as a stop.
-const isLoud = (silence) => silence.for_s > OLD_AFTER / 1000;
+const isLoud = (silence) => !silence.isChosen && silence.for_s > OLD_AFTER / 1000;
 export const isSilent = () => {
   const silence = silenceOf(state.status);
   return silence !== null && isLoud(silence);

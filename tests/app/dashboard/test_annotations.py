@@ -583,3 +583,21 @@ async def test_the_reach_is_that_of_the_map_in_which_an_answer_was_given(both: R
     said = {"x": x + 0.01, "y": y, "kind": "pole", "version": stored.version}
     assert (await edit(client, "PATCH", f"/{number}", **said)).status_code == 200
     assert dashboard.annotation_editor.rows[0].content.reach == 0.1
+
+
+async def test_a_table_whose_diameters_have_another_unit_than_those_of_the_map_is_refused(
+    both: Running,
+) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    assert dashboard.shown is not None
+    trees = dashboard.shown.frame.trees
+    trees.dbh[:] = 0.3
+    places = trees.position[trees.confirmed].tolist()
+    assert len(places) >= 3
+    for factor, code in ((1.0, 200), (2.0, 200), (10.0, 422), (0.1, 422)):
+        rows_ = "".join(f"{x},{y},{30.0 * factor:.3f}\n" for x, y in places)
+        answer = await edit(client, "POST", "/import", table=f"x_m,y_m,dbh_cm\n{rows_}", replaces=True)
+        assert answer.status_code == code, factor
+        if code == 422:
+            assert "times those of the map" in answer.json()["error"]["what"]

@@ -4,6 +4,7 @@ choose is refused."""
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from mcap.writer import Writer
 
 from app.cli import WRONG_USAGE, main
 from app.robot.practice_robot import send
+from app.robot.source import LiveSource
 from app.sources.opening import open_source
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.topics import ODOMETRY, POINT_CLOUD
@@ -50,6 +52,10 @@ def test_a_run_is_sent_as_soon_as_somebody_listens(drive: Path, run: str):
         child.kill()
 
 
+def _takes(source: LiveSource) -> bool:
+    return bool(source.take())
+
+
 @pytest.mark.slow
 def test_who_listens_later_gets_the_fixed_transforms_too():
     port = free_port()
@@ -62,7 +68,7 @@ def test_who_listens_later_gets_the_fixed_transforms_too():
         for _ in range(2):
             with closing(listening(f"zenoh:tcp/127.0.0.1:{port}")) as source:
                 until(source.listen, source.waiting_for)
-                until(lambda source=source: bool(source.take()), source.waiting_for)
+                until(partial(_takes, source), source.waiting_for)
                 heights.append(source.description.T_base_lidar.t[2])
         assert heights == [0.8, 0.8]
     finally:

@@ -137,6 +137,7 @@ async def test_of_two_answers_for_one_tree_at_once_one_is_taken_and_the_other_is
         assert dashboard.shown is not None
         trees = dashboard.shown.frame.trees
         places = trees.position[trees.confirmed].tolist()
+        stored: list[dict[str, Any]] = []
         for k, (x, y) in enumerate(places):
             answers = [
                 edit(client, "POST", "", who, x=x + 0.02 * (who is BOB), y=y, kind=kind)
@@ -145,10 +146,15 @@ async def test_of_two_answers_for_one_tree_at_once_one_is_taken_and_the_other_is
             taken = await asyncio.gather(*answers)
             assert sorted(answer.status_code for answer in taken) == [201, 409]
             refused = next(answer for answer in taken if answer.status_code == 409)
-            assert "this tree was annotated by" in refused.json()["error"]["what"]
+            assert "it was annotated by" in refused.json()["error"]["what"]
             stored = (await client.get("/api/annotations")).json()["trees"]
             assert len(stored) == k + 1
             assert stored[-1]["who"] in refused.text
+        # Who agrees is not refused.
+        agreed = await edit(
+            client, "POST", "", BOB, x=places[-1][0], y=places[-1][1], kind=stored[-1]["kind"]
+        )
+        assert agreed.json()["id"] == stored[-1]["id"]
         # An answer replaces a skip, and a tree beside it is another object.
         x, y = places[0]
         (await edit(client, "DELETE", f"/{stored[0]['id']}", ANN, version=1)).raise_for_status()
