@@ -84,9 +84,8 @@ def reach_at(position: Float, place: tuple[float, float]) -> float | None:
     """Return the distance below which a rejection that is made now can be about a mapped tree [m]; None for
     SAME_THING.
 
-    A rejection is about the tree at its place. If a later map lacks that tree, the rejection must not be
-    taken for one of its neighbour, which was there before. The boundary is half-way between the distances of
-    both.
+    A rejection is about the nearest tree. In a later map without that tree, it must not belong to the second
+    nearest one. The limit is the mean of the distances of both.
 
     Args:
         position: Positions of the trees that are mapped now, shape (T, 2) [m].

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from app.store.store import Store
 
 # Largest distance between an annotation and its row in an exported table [m], which has 0.1 mm.
-_SAME_PLACE = 0.001
+SAME_PLACE = 0.001
 # Two diameters are the same below this difference [m]: an exported table has 0.1 mm.
 _SAME_DBH = 0.0001
 
@@ -433,7 +433,7 @@ def import_plan(
     filled, replaced, conflicts = set[int](), set[int](), list[tuple[Content, Content]]()
     for k, content in enumerate(contents, start=len(rows)):
         if k not in same:
-            near = at.query_ball_point((content.x, content.y), _SAME_PLACE)
+            near = at.query_ball_point((content.x, content.y), SAME_PLACE)
             objects = {object_of[j] for j in near if j in object_of}
             object_of[k] = min(objects, key=lambda j: (known[j].kind != content.kind, j), default=k)
         j = object_of[k]
@@ -456,7 +456,7 @@ def import_plan(
         for of in (filled - replaced, replaced)
     ]
     repeated = len(contents) - len(added) - len(filled | replaced) - len(conflicts)
-    beside = [distance for _, distance in same.values() if distance > _SAME_PLACE]
+    beside = [distance for _, distance in same.values() if distance > SAME_PLACE]
     return ImportPlan(added, edits[0], edits[1], conflicts, repeated, beside)
 
 
@@ -473,7 +473,7 @@ def _same_things(known: Sequence[Content], number: int) -> dict[int, tuple[int, 
     places = np.array([(each.x, each.y) for each in known]).reshape(-1, 2)
     near = cKDTree(places[number:]).query_ball_tree(cKDTree(places[:number]), SAME_THING)
     pairs = [
-        (max(math.dist(places[k], places[j]), _SAME_PLACE), known[k].kind != known[j].kind, k, j)
+        (max(math.dist(places[k], places[j]), SAME_PLACE), known[k].kind != known[j].kind, k, j)
         for k, annotations in enumerate(near, start=number)
         for j in annotations
         if math.dist(places[k], places[j]) < reach_of(known[j])

@@ -291,14 +291,15 @@ class ShownRun:
         counts = self.shown.counts
         if counts is None:
             return {"warnings": self.warnings()}
-        is_far = scores is not None and scores["TA"]["of"] + scores["TR"]["of"] == 0
-        warnings = self.warnings(*([far_truth(scores["reach"])] if scores is not None and is_far else []))
+        of_scores = []
+        if scores is not None and scores["TA"]["of"] + scores["TR"]["of"] == 0:
+            of_scores.append(far_truth(scores["reach"]))
         worst = {} if counts.sigma_xy_m is None else {"sigma_xy_m": counts.sigma_xy_m}
         return {
             **({"health": {"scans": counts.health, "worst": worst}} if counts.health else {}),
             "verdicts": counts.verdicts,
             "losses": counts.losses,
-            "warnings": warnings,
+            "warnings": self.warnings(*of_scores),
         }
 
 

@@ -155,8 +155,8 @@ LOST = """async (zone) => {
   changed('map');
   changed('status');
   const way = document.querySelector('#way');
-  const { isLost } = await import('/static/js/shell/status.js');
-  return [way.hidden ? '' : way.innerText, way.dataset.zone, isLost()];
+  const { isPoseLost } = await import('/static/js/shell/status.js');
+  return [way.hidden ? '' : way.innerText, way.dataset.zone, isPoseLost()];
 }"""
 # One that waits for its first scan.
 UNHEARD = """async () => {

@@ -17,7 +17,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from app.batch.run_edits import SAME_THING, annotation_of_tree, reach_at
-from app.dashboard.annotations import Against, carried_back, import_plan, row_payload
+from app.dashboard.annotations import SAME_PLACE, Against, carried_back, import_plan, row_payload
 from app.dashboard.dashboard import Dashboard
 from app.store.records import (
     KINDS,
@@ -41,7 +41,6 @@ from pipeline.types.records import Trees
 router = APIRouter(prefix="/api")
 
 _LARGEST_DBH_M = 10.0
-_SAME_PLACE_M = 0.001  # the page states places to 0.1 mm
 _AT_TREE_M = 0.1  # an answer is given at the tree, which moves in a live map until it arrives
 _FEW_DIAMETERS = 3  # of a table and of the map, whose median tells the unit
 _MOST_NAMED = 3  # contradictions of an import that are named
@@ -112,7 +111,7 @@ async def add(body: _AddAnnotation, dashboard: Dash) -> Response:
     def add_first(store: Store, run: int, author: Author) -> int:
         known = [row for row in store.annotations(run) if row.content.kind in (*KINDS, SKIPPED)]
         other = None if trees is None else _answer_before(trees, known, content)
-        if other is not None and (other.content.kind, None) == (content.kind, content.dbh):
+        if other is not None and other.content.kind == content.kind and content.dbh is None:
             return other.id  # both agree
         if other is not None:
             raise StaleError(
@@ -243,7 +242,7 @@ def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     of the tree that it is about in the map of the shown scan, None for none; for a run of one step, in the
     coordinates of its file."""
     x, y = dashboard.offset
-    tree_of = _trees_of(dashboard)
+    tree_of = _tree_numbers(dashboard)
     rows = [(row_payload(row), tree_of.get(row.content)) for row in dashboard.annotation_editor.rows]
     return [{**row, "x": row["x"] + x, "y": row["y"] + y, "tree": tree} for row, tree in rows]
 
@@ -270,8 +269,9 @@ def _answer_before(trees: Trees, known: Sequence[Annotation], content: Content) 
     if not len(away) or away.min() >= _AT_TREE_M:
         return None
     row = annotation_of_tree(position, [each.content for each in known]).get(int(away.argmin()))
-    other = None if row is None else known[row]
-    return None if other and other.content.kind == SKIPPED != content.kind else other
+    if row is None or (known[row].content.kind == SKIPPED and content.kind != SKIPPED):
+        return None
+    return known[row]
 
 
 def _reach_after(dashboard: Dashboard, number: int, body: _AnnotationChange) -> float | None:
@@ -281,15 +281,16 @@ def _reach_after(dashboard: Dashboard, number: int, body: _AnnotationChange) -> 
     before = next((row.content for row in [*editor.rows, *editor.skipped] if row.id == number), None)
     if before is not None:
         moved = math.dist((body.x, body.y), (before.x, before.y))
-        has_no_tree = before.kind != SKIPPED and before not in _trees_of(dashboard)
-        if moved < (SAME_THING if has_no_tree else _SAME_PLACE_M) and (
-            has_no_tree or body.kind == before.kind
-        ):
+        if before.kind != SKIPPED and before not in _tree_numbers(dashboard):
+            stays = moved < SAME_THING
+        else:
+            stays = moved < SAME_PLACE and body.kind == before.kind
+        if stays:
             return before.reach
     return _reach_at(dashboard, body.x, body.y)
 
 
-def _trees_of(dashboard: Dashboard) -> dict[Content, int]:
+def _tree_numbers(dashboard: Dashboard) -> dict[Content, int]:
     """Return a dict from each annotation that is about a tree of the map of the shown scan to the number of
     that tree, see `reviews_of`."""
     if dashboard.shown is None:
@@ -303,7 +304,7 @@ def _trees_of(dashboard: Dashboard) -> dict[Content, int]:
 
 def _difference(dashboard: Dashboard, here: Content, there: Content) -> str:
     """Return how a row of a table (`there`) contradicts the annotation at its place."""
-    number = _trees_of(dashboard).get(here)
+    number = _tree_numbers(dashboard).get(here)
     x, y = dashboard.offset
     name = f"the annotation at {here.x + x:.2f}, {here.y + y:.2f}" if number is None else f"tree {number}"
     if here.kind != there.kind:

@@ -4,7 +4,7 @@
 import { byId, recall, remember } from "../core/dom.js";
 import { isPlaying, on, state } from "../core/store.js";
 import { setTheme, themeName } from "../core/theme.js";
-import { isLost, isSilent } from "./status.js";
+import { isPoseLost, isSilent } from "./status.js";
 
 const TICK = 500; // [ms] between two looks for a silence
 // A signal: frequency of its tones [Hz], duration of each and of the pause after it [ms], vibration and pauses [ms], and time
@@ -29,7 +29,7 @@ function sound({ tone: hertz, tone_ms: length, tones }) {
 const SIGNALS = { "alarm-sound": sound, "alarm-vibration": ({ vibration }) => navigator.vibrate?.(vibration) };
 
 function signal() {
-  const reason = isSilent() || isLost() ? SILENCE : isPlaying() && state.obstacle?.zone === "stop" ? STOP : null;
+  const reason = isSilent() || isPoseLost() ? SILENCE : isPlaying() && state.obstacle?.zone === "stop" ? STOP : null;
   if (!reason || performance.now() - signalledAt < reason.every) return;
   signalledAt = performance.now();
   for (const [id, give] of Object.entries(SIGNALS)) if (byId(id).checked) give(reason);

@@ -97,7 +97,7 @@ export const isSilent = () => {
 };
 let held = { state: "good", reason: "", source: "", at: -Infinity };
 // Whether the line below the strip reports that a robot does not know where it is.
-export const isLost = () => byId("way").dataset.zone === "lost";
+export const isPoseLost = () => byId("way").dataset.zone === "lost";
 
 function health({ health: word, state: phase, source }) {
   const silence = state.connected ? (isOld() ? noData(state.heardAt) : NO_DATA.test(word) && word) : state.lostAt && noData(state.lostAt);
@@ -257,15 +257,15 @@ function showWay() {
   const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld()
     || (state.status?.live && state.status.state === "paused"); // the robot drives on
   const obstacle = !silence && !quiet && WAY[clearance?.zone] ? clearance : null;
-  const isPoseLost = !silence && !quiet && state.status?.live && held.state === "lost" && obstacle?.zone !== "stop";
-  const text = silence ? `■ ${silence.what}` : isPoseLost ? "■ Pose lost" : obstacle && WAY[obstacle.zone];
+  const poseLost = !silence && !quiet && state.status?.live && held.state === "lost" && obstacle?.zone !== "stop";
+  const text = silence ? `■ ${silence.what}` : poseLost ? "■ Pose lost" : obstacle && WAY[obstacle.zone];
   way.hidden = !text;
-  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : isPoseLost ? "lost" : clearance?.zone ?? "";
+  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : poseLost ? "lost" : clearance?.zone ?? "";
   showObstacle(obstacle && state.map.obstacle ? { ...state.map.obstacle, zone: obstacle.zone } : null);
   const [zone, distance, why] = way.children;
   if (text) setText(zone, text);
-  setText(distance, silence ? ` for ${silence.for_s} s` : obstacle && !isPoseLost && obstacle.zone !== "unknown" ? ` ${figure(obstacle.ahead_m)} m ahead` : "");
-  setText(why, silence ? silence.why : isPoseLost ? capital(held.reason) : "");
+  setText(distance, silence ? ` for ${silence.for_s} s` : obstacle && !poseLost && obstacle.zone !== "unknown" ? ` ${figure(obstacle.ahead_m)} m ahead` : "");
+  setText(why, silence ? silence.why : poseLost ? capital(held.reason) : "");
   // Until a person of this browser has seen the setting.
   byId("way-sound").hidden = !state.status?.live || !["stop", "silent", "lost"].includes(way.dataset.zone) || byId("alarm-sound").checked || recall("alarm-sound") !== null;
   // An open dialog covers everything outside of it.

@@ -460,9 +460,8 @@ def _sides(place: Float) -> tuple[float, float]:
 
     if not len(place):
         return 0.0, 0.0
-    line = shapely.linestrings(
-        np.concatenate([place, place[:1]])
-    )  # one object in place of one for each point
+    # One line is one object; points would be one for each.
+    line = shapely.linestrings(np.concatenate([place, place[:1]]))
     corners = shapely.get_coordinates(shapely.oriented_envelope(line))
     sides = np.hypot(*np.diff(corners, axis=0).T)[:2].tolist()  # fewer for points on a line
     narrow, long = sorted([0.0, 0.0, *sides])[-2:]

@@ -216,7 +216,7 @@ function outOfSightText(places) {
   return ` Added by people outside the observed area: ${[...named, ...(more ? [`and ${more} more`] : [])].join("; ")}.`;
 }
 
-const UNKNOWN_ERROR = " The error of the stems is not known where all of the area was observed and no diameter is near the minimum: only trees that were not found could change the number.";
+const UNKNOWN_ERROR = " The error of the stems is not known where no tree was found or where the observed part is not like the rest.";
 const NO_DECREASE = { "": "Detection does not decrease with distance within reach: the figures are not corrected.",
   correction: "Detection is not estimated: every tree in view counts as found.",
   whole_cloud: "Detection is not estimated for a whole cloud: every tree counts as found.",
