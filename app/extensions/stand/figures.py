@@ -411,7 +411,7 @@ def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
     between plots (ratio estimator), at least that of the errors of the plots: a few plots can be alike by
     chance. The counting error is added to it: all plots share it, so that it neither varies between them nor
     decreases with their number. The weights are the observed areas, for `_plain` names the whole areas. The
-    error is NaN for one plot, and if that of a plot with trees is: what makes it unknown, as many trees
+    error is NaN for one plot, and if that of a plot of several trees is: what makes it unknown, as many trees
     without a diameter, biases the mean too. Plots in which a value is NaN do not count; if all are NaN, so is
     the mean."""
     result = {}
@@ -426,7 +426,7 @@ def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
             result[name] = Estimate()
             continue
         weight, value, se, counting, trees = np.array(rows).T
-        is_unknown = not is_plain and bool((np.isnan(se) & (trees > 0)).any())
+        is_unknown = not is_plain and bool((np.isnan(se) & (trees > 1)).any())
         own = np.maximum(np.square(np.nan_to_num(se)) - np.square(counting), 0.0)
         share = weight / weight.sum()
         mean, k = float(share @ value), len(rows)
