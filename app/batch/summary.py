@@ -250,11 +250,12 @@ def unconfirmed_warning(frame: Frame, parameters: Parameters) -> str:
     tentative = int(np.count_nonzero(~frame.trees.confirmed))
     if parameters.classification.method != "none" or not tentative:
         return ""
-    them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
-    return (
-        f"{them} seen fewer than {parameters.tracking.hits_to_confirm} times and left out of the map; "
-        "--set tracking.hits_to_confirm=1 includes them"
-    )
+    them, p = "1 tree was" if tentative == 1 else f"{tentative} trees were", parameters.tracking
+    times, flags = f"fewer than {p.hits_to_confirm} times", "--set tracking.hits_to_confirm=1"
+    if p.confirm_time:
+        times += f" or for less than {p.confirm_time:g} s"
+        flags += " --set tracking.confirm_time=0"
+    return f"{them} seen {times} and left out of the map; {flags} includes them"
 
 
 _MOST_LISTED = 12  # trees

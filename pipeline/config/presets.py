@@ -53,6 +53,7 @@ _PAPER: dict[str, object] = {
     "tracking.velocity_sigma": 0.1,
     "tracking.acceleration_sigma": 0.001,
     "tracking.proximity_radius": 1.0,
+    "tracking.confirm_time": 0.0,
 }
 
 # A planar laser on a car in a park: trunks have one to ten beams, large distances between each other and a
@@ -85,6 +86,7 @@ _LASER2D: dict[str, object] = {
     "slam.weight_power": 0.3,
     "slam.miss_weight": 1.0,
     "tracking.hits_to_confirm": 5,
+    "tracking.confirm_time": 0.0,
     "slam.update_distance": 0.5,
     "slam.update_interval": 0.0,
     "relocalisation.method": "none",
@@ -111,6 +113,7 @@ _STEMS: dict[str, object] = {
     "slam.noise_turn_distance": 0.6,
     "slam.weight_power": 0.3,
     "classification.method": "none",
+    "tracking.confirm_time": 0.0,
     "tracking.dbh_arc_min": 0.0,
     "tracking.dbh_sigma_max": 0.5,
 }

@@ -369,6 +369,10 @@ class Tracking(Stage):
     hits_to_confirm: int = count(3, "Hits to confirm", "", 1, 200)
     """Detections after which a tree is shown and exported, unless its voxel column confirms it earlier."""
 
+    # A person who walks at 0.5 m/s leaves the proximity radius in 0.8 s, and the track ends.
+    confirm_time: float = number(1.0, "Time to confirm", "s", 0.0, 60.0, 0.1)
+    """Minimum time between the first and the last of these detections."""
+
     dbh_arc_min: float = number(180.0, "Minimum arc for DBH", "deg", 0.0, 360.0, 10.0)
     """Minimum observed arc of the trunk for which a diameter is reported."""
 

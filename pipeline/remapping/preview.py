@@ -29,6 +29,7 @@ from pipeline.jit import compiled
 from pipeline.remapping.rerun import SEGMENTATION_STAGES
 from pipeline.tracking.track_classification import REACH, tree_columns
 from pipeline.types.records import Bool, Clusters, Columns, Frame, Int, Path, Trees, Verdict
+from pipeline.types.units import SECOND_NS
 
 MOST_PLACES = 20_000
 LEAST_HITS = 2  # finds of a tree in the sample, below which the sample says nothing about it
@@ -158,10 +159,9 @@ class ClusterTable:
         verdict: Int = classify_clusters(clusters, parameters).verdict.astype(np.int64)
         return verdict
 
-    def places(self, path: Float, p: Parameters) -> tuple[Float, Int]:
-        """Group the clusters with the verdict TREE by their position in the map, see `grouped`. Return the
-        mean position x, y of each of T groups, shape (T, 2) [m], and its number of clusters, int64, shape
-        (T,). Scans of a lost robot are omitted; at most MOST_PLACES groups are returned.
+    def places(self, path: Float, p: Parameters) -> tuple[Float, Int, Int, Int]:
+        """Group the clusters with the verdict TREE by their position in the map, and return the results of
+        `grouped`. Scans of a lost robot are omitted; at most MOST_PLACES groups are returned.
 
         Args:
             path: x, y [m], yaw [rad] of the base at each stored scan, shape (N, 3).
@@ -292,7 +292,7 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
 
 def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:
     """Return the trees of all scans: first one for each voxel column with the verdict TREE, then each group
-    of clusters (`ClusterTable.places`) with at least `hits_to_confirm` hits and no column within REACH. The
+    of clusters (`ClusterTable.places`) that its hits confirm, and without a column within REACH. The
     hits of a group are its clusters times `spacing`. The tree of a column has position and hits of the
     nearest group within REACH; without one, the position of the column and 0 hits.
 
@@ -302,9 +302,10 @@ def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters
         path: x, y [m], yaw [rad] of the base at these scans, shape (N, 3).
         p: Parameters of verdicts, tracking and classification.
     """
-    place, hits = table.places(path, p)
+    place, hits, first, last = table.places(path, p)
     hits *= known.clusters.spacing
-    confirmed = hits >= p.tracking.hits_to_confirm
+    seen_s = (known.path.stamp_ns[last] - known.path.stamp_ns[first]) / SECOND_NS
+    confirmed = (hits >= p.tracking.hits_to_confirm) & (seen_s >= p.tracking.confirm_time)
     columns = _columns(known, p)
     if columns is None:
         return _Places(place[confirmed], hits[confirmed], np.zeros(np.count_nonzero(confirmed), np.bool_))
@@ -348,8 +349,8 @@ def _with_sample(
     part, fresh = table.of(scans), ClusterTable()
     for n, k in enumerate(scans):
         fresh.put(n, sample[k].clusters, sample[k].sensor_offset, lost=bool(part._lost[n]))
-    old, old_hits = part.places(path[scans], p)
-    new, new_hits = fresh.places(path[scans], p)
+    old, old_hits, *_ = part.places(path[scans], p)
+    new, new_hits, *_ = fresh.places(path[scans], p)
 
     was, now = (
         _sums(nearest_other(place, before.place, REACH), found, len(before.place))
@@ -400,10 +401,12 @@ def _trees(known: _Places) -> Trees:
 
 
 @compiled
-def grouped(centre: Float, tree: Bool, start: Int, pose: Float, reach: float, most: int) -> tuple[Float, Int]:
+def grouped(
+    centre: Float, tree: Bool, start: Int, pose: Float, reach: float, most: int
+) -> tuple[Float, Int, Int, Int]:
     """Group the clusters that are trees, in their order: each joins the group whose mean position is nearest
     and within `reach`, or begins a group. Return the mean position x, y of each of T groups in the map, shape
-    (T, 2) [m], and its number of clusters, int64, shape (T,).
+    (T, 2) [m], its number of clusters, and its first and its last scan, int64, shape (T,).
 
     Args:
         centre: Positions in the level sensor frame, shape (K, 2) [m].
@@ -415,6 +418,7 @@ def grouped(centre: Float, tree: Bool, start: Int, pose: Float, reach: float, mo
         most: Maximum number of groups; clusters that would begin further ones are omitted.
     """
     place, hits, n = np.empty((most, 2)), np.zeros(most, np.int64), 0
+    first, last = np.empty(most, np.int64), np.empty(most, np.int64)
     cells, scale = cells_for(most), per_metre(reach)
     for k in range(pose.shape[0]):
         c, s = np.cos(pose[k, 2]), np.sin(pose[k, 2])
@@ -429,10 +433,12 @@ def grouped(centre: Float, tree: Bool, start: Int, pose: Float, reach: float, mo
             elif n < most:
                 at, n = n, n + 1
                 place[at, 0] = place[at, 1] = 0.0
+                first[at] = k
             else:
                 continue
             hits[at] += 1
+            last[at] = k
             place[at, 0] += (x - place[at, 0]) / hits[at]
             place[at, 1] += (y - place[at, 1]) / hits[at]
             put_in(cells, place, at, scale)
-    return place[:n].copy(), hits[:n].copy()
+    return place[:n].copy(), hits[:n].copy(), first[:n].copy(), last[:n].copy()

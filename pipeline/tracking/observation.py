@@ -7,11 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.config.stages import Tracking
 from pipeline.detection.cylinder_fit import BEAM
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
 from pipeline.tracking.track_table import Rows
 from pipeline.types.records import Bool, Int, Verdict
+from pipeline.types.units import SECOND_NS
 
 SECTORS = 36  # of 10 degrees around a trunk; one bit for each that was seen
 WIDTH = 2.0 * np.pi / SECTORS  # rad
@@ -134,6 +136,7 @@ class FigureLimits(NamedTuple):
 
     Attributes:
         hits_to_confirm: Minimum number of detections of a tree without a class of a voxel column.
+        confirm_ns: Minimum time between the first and the last detection of such a tree [ns].
         dbh_arc_min: Minimum observed arc for a diameter [rad].
         dbh_sigma_max: Maximum standard deviation of a diameter up to THICK [m].
         out_of_round: Standard deviation of the diameters of a stem in all directions, as a fraction of the
@@ -142,10 +145,19 @@ class FigureLimits(NamedTuple):
     """
 
     hits_to_confirm: int
+    confirm_ns: int
     dbh_arc_min: float
     dbh_sigma_max: float
     out_of_round: float
     taper_sigma: float
+
+
+def limits_of(p: Tracking) -> FigureLimits:
+    """Return the limits by the parameters of the tracker."""
+    return FigureLimits(
+        p.hits_to_confirm, round(p.confirm_time * SECOND_NS), np.radians(p.dbh_arc_min), p.dbh_sigma_max,
+        p.out_of_round, p.taper_sigma,
+    )  # fmt: skip
 
 
 @compiled
@@ -184,7 +196,7 @@ def _fill_figures(
         centre_sigma[t] = shape_sigma(tracks.radius[t], tracks.radius_weight[t], coverage[t], limits)
         if tracks.eccentricities[t] > 0:
             mean[t] = tracks.eccentricity[t] / tracks.eccentricities[t]
-        confirmed[t] = is_confirmed(tracks.verdict[t], tracks.hits[t], tracks.score[t], limits)
+        confirmed[t] = is_confirmed(tracks, t, limits)
 
 
 @compiled_borrowing
@@ -221,18 +233,15 @@ def sides_of(bits: int) -> int:
 
 
 @compiled_borrowing
-def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) -> bool:
-    """Return whether a track is a tree: by the class of its voxel column if it has one, else by its hits.
-
-    Args:
-        verdict: Class of the voxel column, see `Verdict`; -1 if there is no class.
-        hits: Number of detections; at least `limits.hits_to_confirm` are required.
-        score: Hits minus misses; must be positive.
-        limits: See FigureLimits.
-    """
-    if verdict >= 0:
-        return bool(verdict == Verdict.TREE)
-    return bool(hits >= limits.hits_to_confirm and score > 0.0)
+def is_confirmed(tracks: Rows, t: int, limits: FigureLimits) -> bool:
+    """Return whether the track in row t is a tree: by the class of its voxel column if it has one, else by
+    the number of its detections, the time between the first and the last one, and a positive score (hits
+    minus misses)."""
+    if tracks.verdict[t] >= 0:
+        return bool(tracks.verdict[t] == Verdict.TREE)
+    seen_ns = tracks.stamp_ns[t] - tracks.first_ns[t]
+    is_seen = tracks.hits[t] >= limits.hits_to_confirm and seen_ns >= limits.confirm_ns
+    return bool(is_seen and tracks.score[t] > 0.0)
 
 
 @compiled_borrowing

@@ -20,7 +20,7 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.association import associate
 from pipeline.tracking.kalman import ENGINES, split
-from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
+from pipeline.tracking.observation import add_observations, limits_of, table_figures
 from pipeline.tracking.track_classification import classify, classify_new
 from pipeline.tracking.track_table import NO_LANDMARK, ScanPose, TrackTable, join
 from pipeline.types.records import Bool, Columns, Detections, Int, Landmarks, PoseEstimate, Trees, Verdict
@@ -200,10 +200,7 @@ class Tracker:
         columns are copies. The errors that all views of a trunk share, by its bark (SHARED_SIGMA) and its
         shape (`shape_sigma`), are added to the covariances. Diameters and eccentricities are NaN where they
         are unknown; heights and leans are None."""
-        t, p = self.tracks, self.parameters
-        limits = FigureLimits(
-            p.hits_to_confirm, np.radians(p.dbh_arc_min), p.dbh_sigma_max, p.out_of_round, p.taper_sigma
-        )
+        t, limits = self.tracks, limits_of(self.parameters)
         coverage, dbh, dbh_sigma, by_shape, eccentricity, confirmed = table_figures(t.as_rows(), limits)
         shared = SHARED_SIGMA**2 + np.square(by_shape)
         return Trees(

@@ -22,7 +22,7 @@ from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
 from pipeline.slam.places import Places
-from pipeline.tracking.observation import SECTORS
+from pipeline.tracking.observation import SECTORS, limits_of, table_figures
 from pipeline.tracking.track_table import NO_LANDMARK, TrackTable, join
 from pipeline.types.records import Columns, Int, Verdict
 
@@ -84,8 +84,8 @@ def merge_maps(
     for k in np.flatnonzero(~fresh):
         join(both, int(row_of[k]), len(a.tracks) + int(k))
     matched = row_of[~fresh]
-    shown = (moved.verdict[~fresh] < 0) & (moved.hits[~fresh] >= parameters.tracking.hits_to_confirm)
-    hidden = ((a.tracks.verdict[matched] < 0) | shown) & (both.verdict[matched] != Verdict.TREE)
+    shown = (moved.verdict < 0) & table_figures(moved.as_rows(), limits_of(parameters.tracking))[-1]
+    hidden = ((a.tracks.verdict[matched] < 0) | shown[~fresh]) & (both.verdict[matched] != Verdict.TREE)
     both.verdict[matched[hidden]] = -1  # a tree that one of the runs confirmed by its hits stays confirmed
     both.number[len(a.tracks) :] = number_of
     tracks = both.take(np.concatenate([np.ones(len(a.tracks), np.bool_), fresh]))

@@ -117,8 +117,10 @@ def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
         elif len(place) < most:
             place.append(x)
             hits.append(1)
-    found, times = grouped(centre, tree, np.array([0, 100, 300]), np.zeros((2, 5)), reach, most)
+    found, times, first, last = grouped(centre, tree, np.array([0, 100, 300]), np.zeros((2, 5)), reach, most)
     assert times.tolist() == hits
+    assert [first.min(), last.max()] == [0, 1]
+    assert (last - first <= hits).all()
     assert found == pytest.approx(np.array(place), abs=1e-9)
 
 

@@ -347,16 +347,23 @@ def test_the_errors_of_an_oval_stem_are_those_of_circles_that_are_fitted_to_it(v
     seen = ONE_VIEW + np.radians(10.0) * views
     by_shape = out_of_round * RADIUS_GAIN * one_sidedness(seen, 2)
     assert np.sqrt(np.mean(errors[:, 2] ** 2)) == pytest.approx(by_shape, abs=0.1)
-    limits = FigureLimits(3, 0.0, 0.5, out_of_round, 0.0)
+    limits = FigureLimits(3, 0, 0.0, 0.5, out_of_round, 0.0)
     centre = np.sqrt(np.mean(errors[:, :2] ** 2))
     sigma = shape_sigma(2.0, 2.0, seen, limits)  # radius 1
     assert centre == pytest.approx(sigma, abs=0.1)
 
 
 def test_confirmation_comes_with_the_hits():
-    t = tracker(hits_to_confirm=3)
+    t = tracker(hits_to_confirm=3, confirm_time=0.0)
     told = [bool(show(t, k, [[5.0, 0.0]]).confirmed[0]) for k in range(4)]
     assert told == [False, False, True, True]
+
+
+def test_confirmation_comes_with_the_time_between_detections():
+    t = tracker(hits_to_confirm=3, confirm_time=1.0)
+    scans = (0, 1, 2, 9, 10, 11)  # 0.1 s apart
+    told = [bool(show(t, k, [[5.0, 0.0]]).confirmed[0]) for k in scans]
+    assert told == [False, False, False, False, True, True]
 
 
 def test_times_are_those_of_the_first_and_the_last_view():
