@@ -16,6 +16,7 @@ from pipeline.tracking.track_classification import REACH, SHARED_SURROUNDINGS, _
 from pipeline.tracking.track_table import TrackTable
 from pipeline.tracking.tracker import COLUMN_SIGMA
 from pipeline.types.records import RING_FAR, Columns, Verdict
+from pipeline.types.units import SECOND_NS
 from tests.pipeline.strategies import detections, track
 from tests.pipeline.tracking.test_round_fit_override import PLACE, column
 
@@ -173,7 +174,7 @@ def between(verdict: Verdict, away: float, hits: int = 3):
     """The verdict of a track that came since its column was judged, and whether it is a tree of the map."""
     tracker = Tracker(FOREST.tracking)
     table = TrackTable.empty(1)
-    table.number[0], table.hits[0] = 1, hits
+    table.number[0], table.hits[0], table.stamp_ns[0] = 1, hits, 2 * SECOND_NS
     table.x[0, :2] = PLACE + np.array([away, 0.0])
     tracker.tracks, tracker.next_number = table, 2
     tracker.classify_new(column(verdict))
