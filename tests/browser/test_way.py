@@ -406,7 +406,8 @@ def test_a_warning_of_a_live_run_tells_once_that_sound_is_off(dashboard: Dashboa
 # A live run that a person has paused.
 PAUSED = """async () => {
   const { state, changed } = await import('/static/js/core/store.js');
-  state.status = { ...state.status, live: true, state: 'paused', health: 'good', silence_s: 23 };
+  state.status = { ...state.status, live: true, state: 'paused', health: 'good', silence_s: 0,
+    map_age_s: 23 };
   state.statusAt = performance.now();
   changed('status');
   const way = document.querySelector('#way');

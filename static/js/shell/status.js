@@ -65,10 +65,11 @@ function dataOf(s) {
   return [age === null ? NONE : age < 10 ? age.toFixed(1) : String(Math.floor(age)), isDoubtful ? "warn" : "", `link: ${lost} lost\nmapping: ${leftOut} left out`, age === null ? "" : "s old"];
 }
 
-// [s] since the newest scan of a robot came; null before the first one, and after the run.
-function ageOf({ silence_s: silence, state: phase }) {
-  if (silence === null || silence === undefined || phase === "finished") return null;
-  return silence + (performance.now() - state.statusAt) / 1000;
+// [s] since the newest scan of a robot came, or while paused since one was mapped; null before the first one, and after the run.
+function ageOf({ silence_s: silence, map_age_s: mapAge, state: phase }) {
+  const age = phase === "paused" ? mapAge : silence;
+  if (age === null || age === undefined || phase === "finished") return null;
+  return age + (performance.now() - state.statusAt) / 1000;
 }
 
 // Explanations of the first states.
@@ -85,8 +86,9 @@ function silenceOf(s) {
   if (!s?.live || s.scan_index < 0 || state.refused || [...NO_FIGURES, "finished"].includes(s.state)) return null;
   if (!state.connected) return state.lostAt ? { what: "No connection", for_s: seconds(state.lostAt), why: "The page reconnects by itself." } : null;
   if (isOld()) return { what: "No data", for_s: seconds(state.heardAt), why: "The program sends nothing." };
-  if (s.state === "paused") return { what: "Paused: not current", for_s: Math.floor(ageOf(s) ?? 0), why: "The robot may drive on; obstacles are not reported. Play returns to it.", isChosen: true };
-  if (!NO_DATA.test(s.health)) return null;
+  const isUnheard = NO_DATA.test(s.health);
+  if (s.state === "paused") return { what: "Paused: not current", for_s: Math.floor(ageOf(s) ?? 0), why: isUnheard ? capital(s.detail) : "The robot may drive on; obstacles are not reported. Play returns to it.", isChosen: true };
+  if (!isUnheard) return null;
   return { what: "No data", for_s: Math.floor(ageOf(s) ?? 0), why: capital(s.detail.replace(/^Nothing heard for \d+ s: /, "")) };
 }
 // Whether the line below the strip reports a silence as loudly as a stop.
@@ -151,7 +153,7 @@ function show() {
   cells.health.cell.title = healthFigures();
   cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has the times of the run.";
   cells.rate.cell.title = "Scans that were mapped in a second, over the last 20 of them";
-  cells.data.cell.title = "Time since the newest scan of the robot came. Link: scans that the network lost. Mapping: scans that came and are not in the map, because mapping was behind or they could not be read";
+  cells.data.cell.title = "Time since the newest scan of the robot came, while paused since one was mapped. Link: scans that the network lost. Mapping: scans that came and are not in the map, because mapping was behind or they could not be read";
   cells.behind.cell.title = "Scans that wait to be mapped";
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
