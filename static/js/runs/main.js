@@ -3,12 +3,15 @@
 import { get, open, patch, post, remove as removeAt } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { count, figure, NONE, percent } from "../core/format.js";
+import { connect } from "../core/live_feed.js";
 import { startAccess } from "../core/permissions.js";
 import { on } from "../core/store.js";
 import { startTheme } from "../core/theme.js";
 import { confirmLeaving } from "../open/leaving.js";
 import { startUpload } from "../open/upload.js";
 import { ofExtensions, startExtensions } from "../shell/extensions.js";
+import { startSignals } from "../shell/signals.js";
+import { startWay } from "../shell/way.js";
 import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
@@ -161,8 +164,11 @@ startUpload(async ({ uri }) => {
   location.href = "/";
 });
 startTheme();
+startWay();
+startSignals();
 startExtensions();
 byId("runs-compare").hidden = !comparable;
 startAccess();
+connect();
 load();
 follow();
