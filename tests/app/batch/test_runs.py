@@ -225,6 +225,8 @@ async def test_a_run_is_played_again_with_its_parameters(both: Running) -> None:
     await play(dashboard, "other:", run=2)
     await client.post("/api/parameters/preset", json={"name": "paper"})
     key = next(row["key"] for row in await runs(client) if row["uri"] == "fake:")
+    assert (await client.post(f"/api/runs/{key}/replay?check_only=true")).status_code == 202
+    assert dashboard.source.uri == "other:", "the open run is kept"
     assert (await client.post(f"/api/runs/{key}/replay")).status_code == 202
     await dashboard.receive(opened("fake:", run=3))
     worker = dashboard.worker
