@@ -532,11 +532,21 @@ class Dashboard:
         if status.scan_index < 0:
             return
         is_new = self.events.warned(status.warnings, status.time_s)
-        if status.live and status.state == "waiting":
-            is_new |= self.events.silent(status.detail, status.time_s)
+        if status.live:
+            is_new |= self._note_gaps(status)
         is_new |= self.events.recorded(status.recording, status.recorded_file, status.time_s)
         if is_new:
             self._broadcast_events()
+
+    def _note_gaps(self, status: protocol.Status) -> bool:
+        """Add events for a silence and a pause of a live run; return whether there are any."""
+        is_paused = status.state == "paused"
+        is_new = self.events.paused(is_paused, status.time_s)
+        if status.state == "waiting" or (is_paused and status.health.startswith("no data")):
+            is_new |= self.events.silent(status.detail, status.time_s, status.silence_s or 0.0)
+        elif is_paused:
+            is_new |= self.events.heard(status.time_s)
+        return is_new
 
 
 def _no_path() -> GrowingColumns:

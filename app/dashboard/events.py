@@ -15,9 +15,13 @@ from app.sources.live_address import SILENT_S
 from pipeline.config.model import Value
 from pipeline.types.records import Float, Frame, Zone
 
-Kind = Literal["tree", "warning", "change", "health", "annotation", "stop", "slow", "silence", "recording"]
+Kind = Literal[
+    "tree", "warning", "change", "health", "annotation", "stop", "slow", "silence", "pause", "recording"
+]
 
-_OF_THE_SCANS = ("health", "stop", "slow", "silence")  # they end when the robot sends no data
+_OF_THE_SCANS = ("health", "stop", "slow")  # nothing is known of them in a gap
+_GAPS = ("silence", "pause")
+_OF_THE_READER = (*_GAPS, "recording")  # in a live run they last by the clock of this computer
 _OF_THE_MAP = ("tree", "health")  # created again when the run is mapped with other parameters
 _MOST = 400
 #: Count at the end of a warning, such as "scans lost on the network (3)".
@@ -33,12 +37,13 @@ class Event:
     Attributes:
         time_s: Time since the first scan of the run [s].
         kind: Tree mapped, warning, parameters changed, pose quality changed, annotation, obstacle in the stop
-            or slow zone, robot without data, or recording.
+            or slow zone, robot without data, pause of a live run, or recording.
         text: Description for people.
-        lasts: Whether it lasts until the next event of its kind; also until the robot sends no data, except a
+        lasts: Whether it lasts until the next event of its kind; pose quality and obstacles also until the
+            robot sends no data or the live run is paused.
+        noted_s: Time by the clock of this computer at which it was noted, or a silence began [s since 1970];
+            None if it was noted again later, by a map with other parameters, and for a silence in a
             recording.
-        noted_s: Time by the clock of this computer when it was noted [s since 1970]; None if it was noted
-            again later, by a map with other parameters.
     """
 
     time_s: float
@@ -50,7 +55,7 @@ class Event:
 
 class Events:
     """Events of a run, at most 400. Beyond them the oldest obstacles in the slow zone are removed first, then
-    trees, then warnings and edits, and stops, silences, recordings and the pose quality last.
+    trees, then warnings and edits, and stops, silences, pauses, recordings and the pose quality last.
 
     After a change of parameters, events later than the current scan remain, flagged as from before the
     change, until the run reaches them again.
@@ -155,21 +160,44 @@ class Events:
         usual_s = np.percentile(np.diff(scans_s), 25, method="lower") if len(scans_s) > 1 else 0.0
         for k in np.flatnonzero(np.diff(new) > max(SILENT_S, 2.0 * usual_s)).tolist():
             self.silent("No scans in the recording", float(new[k]))
-            self._turn("silence", False, float(new[k + 1]), "Data again")
+            self._turn("silence", False, float(new[k + 1]), "Data again", None)
             self._silent_since = math.nan  # a person may go back before it
 
-    def silent(self, why: str, time_s: float) -> bool:
-        """Add an event for a robot that sends no data, unless it has one; it ends with the next shown scan.
-        Return whether it was added. What lasts until then ends, since nothing is known of the time of a
-        silence; if it is still there in the next shown scan, it begins again.
+    def silent(self, why: str, time_s: float, ago_s: float | None = None) -> bool:
+        """Add an event for a robot that sends no data, unless it has one; it ends with the next shown scan,
+        or with `heard`. Return whether it was added. What lasts until then ends, since nothing is known of
+        the time of a silence; if it is still there in the next shown scan, it begins again.
 
         Args:
             why: The reason.
             time_s: Time of the last scan [s since the first scan].
+            ago_s: Time since it arrived [s]; None in a recording.
         """
         text = _SINCE.sub("Nothing heard", why)  # the event has its own duration
-        if not self._turn("silence", True, time_s, text[:_LONGEST]):
-            return False
+        return self._turn("silence", True, time_s, text[:_LONGEST], ago_s) and self._interrupt(time_s)
+
+    def heard(self, time_s: float) -> bool:
+        """End the event of a silence without a scan, as while the run is paused; return whether there was
+        one.
+
+        Args:
+            time_s: Time of the last shown scan [s since the first scan].
+        """
+        return self._turn("silence", False, time_s, "Data again")
+
+    def paused(self, is_paused: bool, time_s: float) -> bool:
+        """Add an event when a live run is paused, which ends what lasts as a silence does, or when the pause
+        ends; return whether it was added.
+
+        Args:
+            is_paused: Whether it is paused now.
+            time_s: Time of the last scan [s since the first scan].
+        """
+        text = "Paused: obstacles are not reported" if is_paused else "The pause ended"
+        return self._turn("pause", is_paused, time_s, text) and (not is_paused or self._interrupt(time_s))
+
+    def _interrupt(self, time_s: float) -> bool:
+        """End what the scans show, at the time of the last one; return True."""
         self._silent_since = time_s
         self._lasting -= {"stop", "slow"}
         self._health = "good" if self._health == "good" else "unknown"
@@ -207,7 +235,7 @@ class Events:
         if not live:
             self._health = "good"
         for number, at in confirmed:
-            self._note(f"tree {number}", Event(at, "tree", f"Tree {number} mapped"), now=False)
+            self._note(f"tree {number}", Event(at, "tree", f"Tree {number} mapped"), None)
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
         """Add events for warnings that were not active in the last call, without the count at their end,
@@ -262,32 +290,38 @@ class Events:
     def as_plain(self) -> dict[str, Any]:
         """Return {"events": [...]}, a list of a dict for each event, ordered by time, with `t` [s since the
         first scan], `kind` and `text`. Events that last also have `for_s`, their duration [s], None while
-        they last; events with a known `noted_s` have it; events from before a change of parameters `before`,
-        True. The latter are included only up to a total of _MOST events."""
+        they last: of silences, pauses and recordings of a live run by the clock of this computer, because
+        the scans that a slow link held back have the times of the robot. Events with a known `noted_s` have
+        it; events from before a change of parameters `before`, True. The latter are included only up to a
+        total of _MOST events."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]
         marks.sort(key=lambda mark: mark[0].time_s)
-        ends: dict[str, float] = {}  # by the kind, times of the following events
+        ends: dict[str, Event] = {}  # by the kind, the following events
         plain: list[dict[str, Any]] = []
         for event, old in reversed(marks):
             each: dict[str, Any] = {"t": round(event.time_s, 2), "kind": event.kind, "text": event.text}
             if event.lasts:
-                end_s = ends.get(event.kind)
-                each["for_s"] = None if end_s is None else round(end_s - event.time_s, 2)
+                end = ends.get(event.kind)
+                each["for_s"] = None if end is None else round(_between(event, end), 2)
             if event.noted_s is not None:
                 each["noted_s"] = round(event.noted_s, 1)
-            is_silence = event.kind == "silence" and event.lasts
-            ends |= dict.fromkeys(_OF_THE_SCANS if is_silence else (event.kind,), event.time_s)
+            is_gap = event.kind in _GAPS and event.lasts
+            ends |= dict.fromkeys((event.kind, *(_OF_THE_SCANS if is_gap else ())), event)
             plain.append({**each, "before": True} if old else each)
         return {"events": plain[::-1]}
 
-    def _turn(self, kind: Kind, on: bool, time_s: float, text: str) -> bool:
-        """Add an event if what lasts begins or ends with it; return whether it does."""
+    def _turn(self, kind: Kind, on: bool, time_s: float, text: str, ago_s: float | None = 0.0) -> bool:
+        """Add an event if what lasts begins or ends with it, `ago_s` before now if that is known; return
+        whether it does."""
         if on == (kind in self._lasting):
             return False
         self._lasting ^= {kind}
-        self._note(_key(kind, on, time_s), Event(time_s, kind, text, on))
+        key = _key(kind, on, time_s)
+        if kind in _OF_THE_READER and ago_s is not None:
+            key = f"{key} {time.time()}"  # there may be several after one scan
+        self._note(key, Event(time_s, kind, text, on), ago_s)
         return True
 
     def _set_aside(self, which: Callable[[Event], bool]) -> set[str]:
@@ -309,10 +343,11 @@ class Events:
         rows = np.flatnonzero(frame.trees.confirmed & np.isfinite(confirmed_s))
         return dict(zip(frame.trees.number[rows].tolist(), confirmed_s[rows].tolist(), strict=True))
 
-    def _note(self, key: str, event: Event, *, now: bool = True) -> None:
-        """Add an event, which happened `now` or earlier, unless one has its key; beyond _MOST, remove the
-        oldest of those that go first."""
-        self._events.setdefault(key, replace(event, noted_s=time.time()) if now else event)
+    def _note(self, key: str, event: Event, ago_s: float | None = 0.0) -> None:
+        """Add an event, which happened `ago_s` before now if that is known, unless one has its key; beyond
+        _MOST, remove the oldest of those that go first."""
+        noted_s = None if ago_s is None else time.time() - ago_s
+        self._events.setdefault(key, replace(event, noted_s=noted_s))
         while len(self._events) > _MOST:
             del self._events[min(self._events, key=lambda known: _goes(self._events[known].kind))]
 
@@ -320,6 +355,13 @@ class Events:
 def _key(kind: Kind, on: bool, time_s: float) -> str:
     """Return the key of the begin or the end of what lasts."""
     return f"{kind} {on} {time_s:.2f}"
+
+
+def _between(event: Event, end: Event) -> float:
+    """Return the time from an event to its end [s], never negative."""
+    if event.kind in _OF_THE_READER and event.noted_s is not None and end.noted_s is not None:
+        return max(0.0, end.noted_s - event.noted_s)  # a clock may be set back
+    return end.time_s - event.time_s
 
 
 def _goes(kind: Kind) -> int:

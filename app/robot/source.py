@@ -172,6 +172,7 @@ class LiveSource:
         self._publishes = False
         self._publisher: RosPublisher | None = None
         self._map_at_s = -_MAP_PAUSE_S
+        self._mapped_s: float | None = None
         self._camera: LiveCamera | None = None
         self._kept: PictureStore | None = None
         self._failure: SourceError | None = None
@@ -346,14 +347,15 @@ class LiveSource:
 
     def mapped(self, frame: Frame, path: Path, also: Mapping[str, bytes] | None = None) -> None:
         """Publish and record the results of a scan, and store its picture if one is due. Path and trees are
-        published and recorded at most once per second. Nothing happens without publishing, recording and
-        `keep_pictures`.
+        published and recorded at most once per second. Without publishing, recording and `keep_pictures` only
+        `map_age_s` changes.
 
         Args:
             frame: Results of the scan.
             path: Path up to the scan.
             also: Further messages in CDR by their topics, see `pipeline.io.recording.messages`.
         """
+        self._mapped_s = now_s = time.monotonic()
         if self._camera is not None and self._kept is not None and self._kept.is_due(path):
             picture = self.picture_near(frame.stamp_ns)
             if picture is not None:
@@ -361,7 +363,6 @@ class LiveSource:
         if self._publisher is None and self._recorder is None:
             return
         messages = scan_messages(frame) | dict(also or {})
-        now_s = time.monotonic()
         if now_s >= self._map_at_s + _MAP_PAUSE_S:
             self._map_at_s = now_s
             messages |= map_messages(frame, path)
@@ -445,6 +446,11 @@ class LiveSource:
     def silence_s(self) -> float | None:
         """Seconds since the last scan arrived, None before the first."""
         return self._link.silence_s
+
+    @property
+    def map_age_s(self) -> float | None:
+        """Seconds since a scan was mapped, None before the first."""
+        return None if self._mapped_s is None else time.monotonic() - self._mapped_s
 
     def waiting_for(self) -> str:
         """Return why no scans arrive, as text; "" while they arrive."""

@@ -187,16 +187,19 @@ class WorkerLoop:
 
     def _await_command(self) -> protocol.ToWorker | None:
         """Wait for the next command until work is due, see `_patience`, and return it; None ends the worker.
-        Report at intervals that the worker is alive.
+        Report at intervals that the worker is alive; while a robot is paused, how its recording grows.
 
         Raises:
             queue.Empty: Work is due.
         """
-        while (patience_s := self._patience()) is not None and patience_s > _HEARTBEAT_S:
+        while True:
+            patience_s = self._patience()
+            reports = self._session.is_live if patience_s is None else patience_s > _HEARTBEAT_S
+            if not reports:
+                return self._commands.get(timeout=patience_s)
             with contextlib.suppress(queue.Empty):
                 return self._commands.get(timeout=_HEARTBEAT_S)
             self._report()
-        return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
         """Return the time until work is due [s], 0 if it is overdue: `_due_in`, or during a rerun the shorter

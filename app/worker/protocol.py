@@ -55,6 +55,7 @@ class Status:
         scans_left_out: Number of scans that were lost or skipped, or that the reader refused.
         scans_lost: Number of those that the network lost.
         silence_s: Time since the last scan of a robot arrived; None before the first, and if not live.
+        map_age_s: Time since a scan of a robot was mapped; None before the first, and if not live.
         trees: Number of confirmed trees.
         distance_m: Driven distance [m].
         health: Pose quality "good", "weak" or "lost", why it is too early to know (see `health_word`), or
@@ -97,6 +98,7 @@ class Status:
     scans_left_out: int = 0
     scans_lost: int = 0
     silence_s: float | None = None
+    map_age_s: float | None = None
     trees: int = 0
     distance_m: float = 0.0
     health: str = "no scan yet"

@@ -113,6 +113,11 @@ class Session:
         return "replay" if self._state == "playing" else "idle"
 
     @property
+    def is_live(self) -> bool:
+        """Whether the source is a robot, whose run may have ended."""
+        return self._robot is not None
+
+    @property
     def run(self) -> AnyRun | None:
         """The open run, or None."""
         return self.shown.run
@@ -310,7 +315,7 @@ class Session:
         Returns:
             The sought scan if it was mapped, see `ShownMap.is_stored`; else None.
         """
-        if self.run is None or self._is_live():
+        if self.run is None or self._refuses_seek():
             return None
         here = self.run.current if self._target.index is None else self._target.index
         self._settle()
@@ -325,7 +330,7 @@ class Session:
         Returns:
             The sought scan if it was mapped, see `ShownMap.is_stored`; else None.
         """
-        if self.run is None or not math.isfinite(time_s) or self._is_live():
+        if self.run is None or not math.isfinite(time_s) or self._refuses_seek():
             return None
         if self._state != "playing":
             self._settle()
@@ -482,11 +487,11 @@ class Session:
         self.end_recording()
         self._state = "finished"
 
-    def _is_live(self) -> bool:
+    def _refuses_seek(self) -> bool:
         """Return whether the run is live; if so, add a warning that it cannot seek."""
-        if self._robot is not None:
+        if self.is_live:
             self._warn(["a live run cannot step or seek: open its recording"])
-        return self._robot is not None
+        return self.is_live
 
     def _settle(self) -> None:
         """Set the state "paused", whatever it was, and remove the reason of a failure."""
@@ -524,16 +529,19 @@ class Session:
 
 def with_robot(status: Status, robot: LiveSource) -> Status:
     """Return the status with the fields of a live run: namespaces, scans and recording of its robot.
-    If the run plays or waits and the robot is silent, the state is "waiting", `detail` has the reason, and
-    the quality of the last pose gives way to the time without data."""
+    If the run plays or waits and the robot is silent, the state is "waiting". Then, and if it is silent while
+    the run is paused, `detail` has the reason, and the quality of the last pose gives way to the time without
+    data."""
     # While scans wait the robot is not silent, even if its link had no time to note it during a compilation.
-    is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
+    # A paused run lets them wait.
+    is_paused = status.state == "paused" and status.scan_index >= 0
+    is_asked = is_paused or (status.state in ("playing", "waiting") and not robot.scans_waiting)
     silent = robot.waiting_for() if is_asked else ""
     silence_s = robot.silence_s
     is_old = bool(silent) and silence_s is not None and status.scan_index >= 0
     return replace(
         status,
-        state="waiting" if silent else status.state,
+        state="waiting" if silent and not is_paused else status.state,
         detail=silent or status.detail,
         health=f"no data for {silence_s:.0f} s" if is_old else status.health,
         live=True,
@@ -542,6 +550,7 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
         scans_behind=robot.scans_waiting,
         scans_lost=robot.losses.get(LOST_SCANS, 0),
         silence_s=None if silence_s is None else round(silence_s, 1),
+        map_age_s=None if robot.map_age_s is None else round(robot.map_age_s, 1),
         recording=robot.recording,
         recorded_file=robot.recorded_file,
     )

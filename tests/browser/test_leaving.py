@@ -63,6 +63,12 @@ def test_another_run_is_opened_by_a_second_press_while_a_robot_is_open(
             assert made.ask("/api/status")["source"] == uri
 
         page.locator("#source-button").click()
+        page.locator("#source-uri").fill(str(tmp_path / "missing.mcap"))
+        page.locator("#source-open").click()
+        expect(page.locator("#source-error")).to_contain_text("missing.mcap")
+        expect(page.locator("#leaving")).to_have_count(0)
+        assert all("409" in error for error in made.errors)
+        made.errors.clear()
         page.locator("#source-uri").fill(OTHER)
         page.locator("#source-open").click()
         asks()

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.app.robot.conftest import free_port
 from tests.browser.conftest import opened
@@ -141,6 +141,31 @@ def test_a_dialog_that_was_left_begins_with_the_whole_list_and_records_again(dia
     expect(listed).to_have_count(shown)
     dialog.locator("#source-robot summary").click()
     expect(record).to_be_checked()
+    dialog.locator("#source-robot summary").click()
+
+
+def test_the_topics_are_read_again_after_another_address_of_a_robot(dialog: Page) -> None:
+    asked: list[str] = []
+
+    def answer(route: Route) -> None:
+        asked.append(route.request.post_data_json["uri"])
+        route.fulfill(json={"topics": [], "mount": None, "warnings": [f"Topics of {asked[-1]}"]})
+
+    dialog.route("**/api/inside", answer)
+    dialog.locator("#source-robot summary").click()
+    host, told = dialog.locator("#robot-fields [name=host]"), dialog.locator("#inside-body")
+    host.fill("10.0.0.6")
+    dialog.locator("#source-inside summary").click()
+    expect(told).to_contain_text("Topics of zenoh:tcp/10.0.0.6:7447")
+    host.fill("10.0.0.7")
+    host.press("Tab")
+    expect(told).to_contain_text("Topics of zenoh:tcp/10.0.0.7:7447")
+    dialog.locator("#robot-kind").select_option("velodyne")
+    expect(told).to_contain_text("Topics of velodyne:0.0.0.0:2368?from=192.168.1.201")
+    assert len(asked) == 3
+    dialog.unroute("**/api/inside")
+    dialog.locator("#robot-kind").select_option("zenoh")
+    dialog.locator("#source-inside summary").click()
     dialog.locator("#source-robot summary").click()
 
 

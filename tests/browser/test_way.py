@@ -125,17 +125,20 @@ def test_no_dialog_covers_the_stop_of_an_obstacle(dashboard: Dashboard):
 
 
 # A live run that waits for its robot, with a long reason.
-SILENT = """async (for_s) => {
+SILENT_RUN = """async (for_s) => {
   const { state, changed } = await import('/static/js/core/store.js');
   const detail = `Nothing heard for ${for_s} s: robot forwarder-07 is gone; the map goes on when it is back`;
   state.status = { ...state.status, live: true, state: 'waiting', detail, health: `no data for ${for_s} s`,
     silence_s: for_s };
   state.statusAt = performance.now();
   changed('status');
+}"""
+SILENT = f"""async (for_s) => {{
+  await ({SILENT_RUN})(for_s);
   const way = document.querySelector('#way');
   return [way.hidden ? '' : way.innerText, way.dataset.zone, document.querySelector('#notice').hidden,
     ...['.map-frame canvas', '#scene'].map(part => getComputedStyle(document.querySelector(part)).filter)];
-}"""
+}}"""
 # No status of the server replaces the one that a test shows.
 STAYS = """async () => (await import('/static/js/core/live_feed.js')).receive('status', () => {})"""
 # One that has ended.
@@ -155,8 +158,15 @@ LOST = """async (zone) => {
   changed('map');
   changed('status');
   const way = document.querySelector('#way');
-  const { isPoseLost } = await import('/static/js/shell/status.js');
+  const { isPoseLost } = await import('/static/js/shell/way.js');
   return [way.hidden ? '' : way.innerText, way.dataset.zone, isPoseLost()];
+}"""
+# The next map is of a scan at which the pose is known again, before the status says so.
+NEXT_MAP = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.map = { ...state.map, health: { ...state.map.health, state: 'good', reason: '' } };
+  changed('map');
+  return document.querySelector('#way').innerText;
 }"""
 # One that waits for its first scan.
 UNHEARD = """async () => {
@@ -406,11 +416,12 @@ def test_a_warning_of_a_live_run_tells_once_that_sound_is_off(dashboard: Dashboa
 # A live run that a person has paused.
 PAUSED = """async () => {
   const { state, changed } = await import('/static/js/core/store.js');
-  state.status = { ...state.status, live: true, state: 'paused', health: 'good', silence_s: 23 };
+  state.status = { ...state.status, live: true, state: 'paused', health: 'good', silence_s: 0,
+    map_age_s: 23 };
   state.statusAt = performance.now();
   changed('status');
   const way = document.querySelector('#way');
-  const { isSilent } = await import('/static/js/shell/status.js');
+  const { isSilent } = await import('/static/js/shell/way.js');
   return [way.innerText, way.dataset.zone, isSilent(), document.body.classList.contains('stale')];
 }"""
 
@@ -421,7 +432,8 @@ def test_a_paused_live_run_says_that_it_is_not_current_and_makes_no_sound(dashbo
     page.evaluate(STAYS)
     text, zone, is_silent, is_stale = page.evaluate(PAUSED)
     assert "Paused: not current for 23 s" in text
-    assert (zone, is_silent, is_stale) == ("slow", False, True)
+    assert (zone, is_silent) == ("slow", False)
+    assert not is_stale, "a person annotates meanwhile"
     page.evaluate(REAL_STATUS)
     page.reload()
 
@@ -434,6 +446,7 @@ def test_a_lost_pose_of_a_robot_is_reported_below_a_stop(dashboard: Dashboard):
     assert "Pose lost" in text
     assert "The known trees are not found" in text
     assert (zone, is_lost) == ("lost", True)
+    assert "The known trees are not found" in page.evaluate(NEXT_MAP), "its status comes later"
     text, zone, is_lost = page.evaluate(LOST, "stop")
     assert "Stop: obstacle" in text
     assert (zone, is_lost) == ("stop", False)
@@ -442,6 +455,30 @@ def test_a_lost_pose_of_a_robot_is_reported_below_a_stop(dashboard: Dashboard):
     expect(page.locator("#way")).to_be_hidden()
     page.evaluate(REAL_STATUS)
     page.reload()
+
+
+def test_the_page_of_runs_reports_the_open_robot_as_the_dashboard_does(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.stand(6.05)
+    page.evaluate("() => localStorage.setItem('stemmap.alarm-sound', 'on')")
+    dashboard_page = page.url
+    page.get_by_role("link", name="Runs").click()
+    page.evaluate(SIGNALS)
+    page.evaluate(STAYS)
+    dashboard.until("() => document.querySelector('#way').dataset.zone === 'clear'")  # of the open run
+    page.evaluate(PAUSED)
+    expect(page.locator("#way")).to_contain_text("Paused: not current for 23 s")
+    assert page.evaluate(LOST, "stop")[1:] == ["stop", False]
+    assert "Pose lost" in page.evaluate(LOST, None)[0]
+    dashboard.until("() => window.tones.includes(330)")
+    page.evaluate(SILENT_RUN, 12)
+    expect(page.locator("#way")).to_contain_text("No data for 12 s")
+    for width in (1440, 820, 390):
+        page.set_viewport_size({"width": width, "height": 844})
+        dashboard.drawn()
+        assert page.evaluate(COVERED, "#way") == [], f"{width} px"
+    page.evaluate("() => localStorage.removeItem('stemmap.alarm-sound')")
+    page.goto(dashboard_page)
 
 
 def test_a_silence_of_the_robot_has_a_signal_of_its_own(dashboard: Dashboard):
@@ -459,7 +496,7 @@ def test_a_silence_of_the_robot_has_a_signal_of_its_own(dashboard: Dashboard):
     dashboard.until("() => window.tones.length >= 2")  # it repeats
     (told,) = set(page.evaluate("window.tones.splice(0)"))
     assert told != known, "not the signal of the stop zone"
-    is_silent = "async () => (await import('/static/js/shell/status.js')).isSilent()"
+    is_silent = "async () => (await import('/static/js/shell/way.js')).isSilent()"
     assert page.evaluate(is_silent)
     page.evaluate(ENDED_RUN)
     assert not page.evaluate(is_silent), "the run has ended"

@@ -172,9 +172,11 @@ async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
 
 
 @router.post("/open")
-async def open_source(body: _Source, dashboard: Dash, permitted: Permitted, settings: Deployment) -> Response:
-    """POST /api/open: close the run and open another source, with its parameters if any are given. The
-    response is empty (202); the status reports the result. 403 for a file that the caller may not open, 422
+async def open_source(
+    body: _Source, dashboard: Dash, permitted: Permitted, settings: Deployment, check_only: bool = False
+) -> Response:
+    """POST /api/open: close the run and open another source, with its parameters if any are given; with
+    `check_only`, only check whether the source can be opened, and keep the run. The response is empty (202); the status reports the result. 403 for a file that the caller may not open, 422
     for an unknown odometry, invalid parameters or a recording of what is not live, 409 if the source cannot
     be opened or there is no data folder for a recording; the open run is kept then."""
     chosen = {**body.model_dump(exclude={"record"}), "mount": mount_of_degrees(body.mount)}
@@ -182,7 +184,7 @@ async def open_source(body: _Source, dashboard: Dash, permitted: Permitted, sett
     if body.record:
         place = _new_recording(request.uri, settings)
         request = Open(**{name: getattr(request, name) for name in chosen}, record=place)
-    await dashboard.open(request)
+    await (dashboard.check_source(request) if check_only else dashboard.open(request))
     return json_reply({}, 202)
 
 

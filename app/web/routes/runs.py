@@ -116,8 +116,11 @@ async def restore(number: Number, dashboard: Dash) -> Response:
 
 
 @router.post("/{key}/replay")
-async def replay(key: Key, dashboard: Dash, settings: Deployment, permitted: Permitted) -> Response:
-    """Open the source of a run again, with its topics, mounting and final parameters. The response is empty
+async def replay(
+    key: Key, dashboard: Dash, settings: Deployment, permitted: Permitted, check_only: bool = False
+) -> Response:
+    """Open the source of a run again, with its topics, mounting and final parameters; with `check_only`, only
+    check whether it can be opened. The response is empty
     (202); the status reports the result. 403 if the file may not be opened by the caller, 404 for an unknown
     run, 409 if it was live or its source cannot be opened, 422 if its parameters are not valid in this
     version."""
@@ -134,7 +137,8 @@ async def replay(key: Key, dashboard: Dash, settings: Deployment, permitted: Per
         preset=run["preset"],
         parameters=run["parameters"],
     )
-    await dashboard.open(permitted_request(request, permitted))
+    request = permitted_request(request, permitted)
+    await (dashboard.check_source(request) if check_only else dashboard.open(request))
     return json_reply({}, 202)
 
 

@@ -24,7 +24,7 @@ export function showLog() {
   box.dataset.shown = key;
   const isFocused = document.activeElement?.id === "log-kind";
   const choice = el("select", { id: "log-kind", "aria-label": "Events of the log", onchange: () => { filter = choice.value; remember("log", filter); showLog(); } },
-    el("option", { value: LASTING, text: "Obstacles, silences, recordings, weak and lost poses" }), el("option", { value: ALL, text: "All events" }),
+    el("option", { value: LASTING, text: "Obstacles, gaps, recordings, weak and lost poses" }), el("option", { value: ALL, text: "All events" }),
     ...kinds.map((kind) => el("option", { value: kind, text: capital(NAMES[kind] ?? kind) })));
   if (![...choice.options].some(({ value }) => value === filter)) filter = LASTING; // a kind of another run
   choice.value = filter;

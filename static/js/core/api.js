@@ -36,6 +36,8 @@ export const blockFor = (path, body) =>
 
 // Opens a run. A source request is {uri, odometry, seed, topics, mount, preset, parameters}, all but `uri` optional.
 export const open = (source) => post("/api/open", source);
+// Checks whether it could be opened; the open run stays.
+export const check = (source) => post("/api/open?check_only=true", source);
 
 // Commands are sent one at a time, so that two quick steps are two steps.
 let last = Promise.resolve();

@@ -1,6 +1,6 @@
 // The dialog to open a run.
 
-import { open } from "../core/api.js";
+import { check, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital } from "../core/format.js";
 import { on, state } from "../core/store.js";
@@ -45,7 +45,7 @@ export function connectRobot() {
 function choose(uri) {
   if (!isLive(uri) && !ofExtensions("sourceChoice").some((each) => each.takes(uri))) return ask(uri);
   byId("source-uri").value = uri;
-  byId("source-uri").dispatchEvent(new Event("input"));
+  for (const type of ["input", "change"]) byId("source-uri").dispatchEvent(new Event(type));
   return byId("source-open").focus();
 }
 
@@ -75,14 +75,18 @@ export async function ask(uri) {
     return;
   }
   say("");
-  await confirmLeaving();
-  requested = uri;
-  left = state.status;
-  setText(byId("source-open"), "Opening…");
-  showWait(`Checking ${uri}.`);
-  if (isLive(uri)) rememberRobot(uri);
+  const request = { uri, odometry: byId("source-odometry").value, ...(uri === choice()?.address(path()) ? choice().fields() : {}), ...chosenFor(uri), ...recordingOf(uri) };
   try {
-    await open({ uri, odometry: byId("source-odometry").value, ...(uri === choice()?.address(path()) ? choice().fields() : {}), ...chosenFor(uri), ...recordingOf(uri) });
+    await confirmLeaving(async () => {
+      begin(uri);
+      await check(request);
+      if (requested !== uri) await new Promise(() => {}); // another one was requested meanwhile, or none any more
+      end();
+    });
+    begin(uri);
+    left = state.status;
+    if (isLive(uri)) rememberRobot(uri);
+    await open(request);
     if (requested !== uri) return;
     asked = uri;
     showWait(`Opening ${uri}.`);
@@ -92,10 +96,20 @@ export async function ask(uri) {
   }
 }
 
-function finish(message) {
+function begin(uri) {
+  requested = uri;
+  setText(byId("source-open"), "Opening…");
+  showWait(`Checking ${uri}.`);
+}
+
+function end() {
   requested = asked = null;
   setText(byId("source-open"), "Open");
   showWait("");
+}
+
+function finish(message) {
+  end();
   if (message) say(message);
   else dialog.close();
 }

@@ -10,10 +10,12 @@ const DOUBT = 20_000; // [ms] to read the question, which may come after an uplo
 // A live run that has scans in its map or its recording.
 const isLost = ({ live, state: phase, scan_index: scan, recorded_file: file }) => live && phase !== "finished" && (scan >= 0 || Boolean(file));
 
-// Resolves once another run may be opened: at once, or after a second press. A question without an answer does not resolve.
-export async function confirmLeaving() {
+// Resolves once another run may be opened: at once, or after a second press. A question without an answer does not resolve. Before the
+// question, `checked` finds out whether that run can be opened at all; its errors pass through.
+export async function confirmLeaving(checked) {
   const status = state.status ?? await get("/api/status");
   if (!isLost(status)) return;
+  await checked();
   const recorded = status.recording.startsWith("recording") ? status.recorded_file : "";
   await new Promise((resolve) => {
     const line = el("p", { id: "leaving", role: "alert" }, el("span", { text: `The robot's ${recorded ? "run and its recording end" : "run ends"}. Open anyway?` }),

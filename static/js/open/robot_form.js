@@ -38,6 +38,7 @@ export function showRobot(address) {
   fill(last);
   write();
   if (last && uri() !== last) setUri(last); // it has parts that the form does not have
+  settle();
   fields().querySelector("input").focus();
 }
 
@@ -57,9 +58,12 @@ function setUri(address) {
   byId("source-uri").dispatchEvent(new Event("input"));
 }
 
+// The address is complete: what is inside of it can be read.
+const settle = () => byId("source-uri").dispatchEvent(new Event("change"));
+
 function build() {
   fields().replaceChildren(...kind().fields.map(([name, title, placeholder]) =>
-    el("label", {}, title, el("input", { name, type: "text", placeholder, autocomplete: "off", spellcheck: "false", oninput: write }))));
+    el("label", {}, title, el("input", { name, type: "text", placeholder, autocomplete: "off", spellcheck: "false", oninput: write, onchange: settle }))));
 }
 
 function write() {
@@ -73,13 +77,17 @@ export function startRobotForm() {
   choice.addEventListener("change", () => {
     build();
     write();
+    settle();
   });
   build();
   byId("source-record").checked = true;
   const show = () => { byId("source-recorded").hidden = !isLive(uri()); };
   byId("source-uri").addEventListener("input", show);
   byId("source-robot").addEventListener("toggle", ({ target }) => {
-    if (target.open && !uri()) write();
+    if (target.open && !uri()) {
+      write();
+      settle();
+    }
     show();
   });
 }

@@ -7,7 +7,7 @@ import { attempted, showProblem } from "../core/problem.js";
 import { roving } from "../core/roving.js";
 import { on, state } from "../core/store.js";
 
-export const NAMES = { tree: "tree mapped", warning: "warning", change: "parameters changed", health: "SLAM health", annotation: "annotated", stop: "stop zone", slow: "slow zone", silence: "no data", recording: "recording" };
+export const NAMES = { tree: "tree mapped", warning: "warning", change: "parameters changed", health: "SLAM health", annotation: "annotated", stop: "stop zone", slow: "slow zone", silence: "no data", pause: "paused", recording: "recording" };
 const keepTabStop = roving(byId("marks"), ".mark", "horizontal");
 let start = null; // start of a loop whose end is not set yet [s]
 

@@ -1,7 +1,7 @@
 // One run: figures, map, parameters and their changes.
 
 import { dayOf, lasts, logRows, logTable } from "../charts/log_table.js";
-import { get, open } from "../core/api.js";
+import { check, get, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
 import { capital, clock, count, figure, NONE } from "../core/format.js";
@@ -76,7 +76,7 @@ function head(run, { replay, rename, remove }) {
 
 // The files of a live run; a press opens one in the dashboard.
 function recordings({ live, map: { recordings: files } }, guarded) {
-  const show = (uri) => guarded(async () => { await confirmLeaving(); await open({ uri }); location.href = "/"; });
+  const show = (uri) => guarded(async () => { await confirmLeaving(() => check({ uri })); await open({ uri }); location.href = "/"; });
   return el("p", { class: "dim row", id: "run-recordings", hidden: !live || !files, text: files?.length ? "Recorded to" : "Not recorded" }, ...(files ?? []).map((file) =>
     el("button", { class: "small", "data-edit": true, text: file.split(/[/\\]/).pop(), title: `${file}\nOpen this recording in the dashboard`, onclick: show(file) })));
 }

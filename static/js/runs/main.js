@@ -1,14 +1,17 @@
 // The page of runs: a list, and next to it the chosen run or two runs compared.
 
-import { get, open, patch, post, remove as removeAt } from "../core/api.js";
+import { check, get, open, patch, post, remove as removeAt } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { count, figure, NONE, percent } from "../core/format.js";
+import { connect } from "../core/live_feed.js";
 import { startAccess } from "../core/permissions.js";
 import { on } from "../core/store.js";
 import { startTheme } from "../core/theme.js";
 import { confirmLeaving } from "../open/leaving.js";
 import { startUpload } from "../open/upload.js";
 import { ofExtensions, startExtensions } from "../shell/extensions.js";
+import { startSignals } from "../shell/signals.js";
+import { startWay } from "../shell/way.js";
 import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
@@ -106,8 +109,9 @@ function follow() {
 }
 
 async function replay(run) {
-  await confirmLeaving();
-  await post(`/api/runs/${encodeURIComponent(run.key)}/replay`, {});
+  const path = `/api/runs/${encodeURIComponent(run.key)}/replay`;
+  await confirmLeaving(() => post(`${path}?check_only=true`, {}));
+  await post(path, {});
   location.href = "/";
 }
 
@@ -156,13 +160,16 @@ addEventListener("focus", load);
 setInterval(() => { if (!waiting && !document.hidden && !byId("runs").contains(document.activeElement)) load(); }, REFRESH_EVERY);
 on("theme", repaint);
 startUpload(async ({ uri }) => {
-  await confirmLeaving();
+  await confirmLeaving(() => check({ uri }));
   await open({ uri });
   location.href = "/";
 });
 startTheme();
+startWay();
+startSignals();
 startExtensions();
 byId("runs-compare").hidden = !comparable;
 startAccess();
+connect();
 load();
 follow();

@@ -1,39 +1,9 @@
-// Settings of this browser: theme, large controls, and sound and vibration while an obstacle is in the stop zone, a robot sends no data
-// or its pose is lost.
+// Settings of this browser: theme, large controls, and sound and vibration as signals.
 
 import { byId, recall, remember } from "../core/dom.js";
-import { isPlaying, on, state } from "../core/store.js";
+import { on, state } from "../core/store.js";
 import { setTheme, themeName } from "../core/theme.js";
-import { isPoseLost, isSilent } from "./status.js";
-
-const TICK = 500; // [ms] between two looks for a silence
-// A signal: frequency of its tones [Hz], duration of each and of the pause after it [ms], vibration and pauses [ms], and time
-// between two signals while the reason stays [ms].
-const STOP = { tone: 880, tone_ms: 180, tones: 2, vibration: [250, 120, 250], every: 1500 };
-const SILENCE = { tone: 330, tone_ms: 700, tones: 1, vibration: [900], every: 4000 };
-let audio = null, signalledAt = -Infinity;
-
-// A browser plays no sound before a person has clicked or pressed a key.
-function sound({ tone: hertz, tone_ms: length, tones }) {
-  audio ??= new AudioContext();
-  audio.resume();
-  for (let k = 0; k < tones; k += 1) {
-    const tone = audio.createOscillator(), start = audio.currentTime + (2 * k * length) / 1000;
-    tone.frequency.value = hertz;
-    tone.connect(audio.destination);
-    tone.start(start);
-    tone.stop(start + length / 1000);
-  }
-}
-
-const SIGNALS = { "alarm-sound": sound, "alarm-vibration": ({ vibration }) => navigator.vibrate?.(vibration) };
-
-function signal() {
-  const reason = isSilent() || isPoseLost() ? SILENCE : isPlaying() && state.obstacle?.zone === "stop" ? STOP : null;
-  if (!reason || performance.now() - signalledAt < reason.every) return;
-  signalledAt = performance.now();
-  for (const [id, give] of Object.entries(SIGNALS)) if (byId(id).checked) give(reason);
-}
+import { SIGNALS, startSignals, tryOut } from "./signals.js";
 
 function startBox(id, isOn, act) {
   const box = byId(id);
@@ -62,10 +32,10 @@ export function startSettings() {
     remember("large", wanted ? "on" : "off");
     dispatchEvent(new Event("resize")); // of the plots
   });
-  for (const [id, give] of Object.entries(SIGNALS)) {
+  for (const id of Object.keys(SIGNALS)) {
     startBox(id, recall(id) === "on", (wanted) => {
       remember(id, wanted ? "on" : "off");
-      if (wanted) give(STOP); // so that a person knows it
+      if (wanted) tryOut(id);
     });
   }
   byId("way-sound").addEventListener("click", () => {
@@ -75,6 +45,5 @@ export function startSettings() {
   });
   on("status", showStorage);
   byId("alarm-vibration").parentElement.hidden = !navigator.vibrate;
-  on("map", signal);
-  setInterval(signal, TICK); // without data, no map comes
+  startSignals();
 }

@@ -1,6 +1,6 @@
 // Links to share: a view-only link, and one that restores the run, the time and the camera.
 
-import { command, open } from "../core/api.js";
+import { check, command, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { clock, count } from "../core/format.js";
 import { access, endViewerLink, looksOnly, refreshAccess, startAccess } from "../core/permissions.js";
@@ -113,7 +113,7 @@ async function follow() {
   try {
     const source = { uri: run, ...optionsOf(options) };
     if (!isOpen(source)) {
-      await confirmLeaving();
+      await confirmLeaving(() => check(source));
       await open(source);
     }
     if (!await until(() => state.status?.source === run && state.status.scan_index >= 0)) return;

@@ -10,15 +10,12 @@ import { atSecondPress } from "../core/second_press.js";
 import { changed, isDrive, on, state, trees } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 import { isGoing } from "../playback/timeline.js";
+import { ageOf, isOld, NO_FIGURES, noData, poseHealth, seconds, silenceOf, startWay, TESTED } from "./way.js";
 
 const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
 };
-const NO_FIGURES = ["starting", "failed"];
-const TESTED = ["good", "weak", "lost"]; // the pose was tested by trees; else its sigma says nothing
-const OLD_AFTER = 3000; // [ms] without a message while a run plays; longer silences of a robot are red
 const LEFT_OUT = 0.1; // share of the scans above which the map is doubtful, as in app/batch/summary.py
-const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans take longer
 
 // title, unit, function of the status that returns [text, class, title, unit], all but the text may be left out; in the order in
 // which they have the room of a narrow strip
@@ -65,48 +62,13 @@ function dataOf(s) {
   return [age === null ? NONE : age < 10 ? age.toFixed(1) : String(Math.floor(age)), isDoubtful ? "warn" : "", `link: ${lost} lost\nmapping: ${leftOut} left out`, age === null ? "" : "s old"];
 }
 
-// [s] since the newest scan of a robot came; null before the first one, and after the run.
-function ageOf({ silence_s: silence, state: phase }) {
-  if (silence === null || silence === undefined || phase === "finished") return null;
-  return silence + (performance.now() - state.statusAt) / 1000;
-}
-
 // Explanations of the first states.
 const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first scans", static: "SLAM: the sensor has not moved" };
 
-// A state that is worse than that of the newest scan stays for a moment while the run plays, so that a doubt about a few
-// scans can be read.
-const HELD_FOR = 2000; // [ms]
-const NO_DATA = /^no data/; // of a silent robot
-const noData = (since) => `no data for ${seconds(since)} s`;
-
-// A silence of a live run that has mapped something: what is missing, since when [s], and why. Null if there is none.
-function silenceOf(s) {
-  if (!s?.live || s.scan_index < 0 || state.refused || [...NO_FIGURES, "finished"].includes(s.state)) return null;
-  if (!state.connected) return state.lostAt ? { what: "No connection", for_s: seconds(state.lostAt), why: "The page reconnects by itself." } : null;
-  if (isOld()) return { what: "No data", for_s: seconds(state.heardAt), why: "The program sends nothing." };
-  if (s.state === "paused") return { what: "Paused: not current", for_s: Math.floor(ageOf(s) ?? 0), why: "The robot may drive on; obstacles are not reported. Play returns to it.", isChosen: true };
-  if (!NO_DATA.test(s.health)) return null;
-  return { what: "No data", for_s: Math.floor(ageOf(s) ?? 0), why: capital(s.detail.replace(/^Nothing heard for \d+ s: /, "")) };
-}
-// Whether the line below the strip reports a silence as loudly as a stop.
-const isLoud = (silence) => !silence.isChosen && silence.for_s > OLD_AFTER / 1000;
-export const isSilent = () => {
-  const silence = silenceOf(state.status);
-  return silence !== null && isLoud(silence);
-};
-let held = { state: "good", reason: "", source: "", at: -Infinity };
-// Whether the line below the strip reports that a robot does not know where it is.
-export const isPoseLost = () => byId("way").dataset.zone === "lost";
-
-function health({ health: word, state: phase, source }) {
-  const silence = state.connected ? (isOld() ? noData(state.heardAt) : NO_DATA.test(word) && word) : state.lostAt && noData(state.lostAt);
+function health(s) {
+  const { silence, state: word, reason } = poseHealth(s);
   if (silence) return ["no data", "warn", silence.replace("no data ", "")];
-  const known = state.map?.health;
-  const now = { state: word, reason: known?.state === word ? known.reason : "", source, at: performance.now() };
-  const isWorse = TESTED.includes(word) && TESTED.indexOf(held.state) > TESTED.indexOf(word);
-  if (phase !== "playing" || held.source !== source || !isWorse || now.at - held.at > HELD_FOR) held = now;
-  return [held.state, { good: "good", weak: "warn", lost: "bad" }[held.state] ?? "soon", SOON[held.state] || held.reason || "SLAM health"];
+  return [word, { good: "good", weak: "warn", lost: "bad" }[word] ?? "soon", SOON[word] || reason || "SLAM health"];
 }
 
 const sigma = (metres) => (metres < 1 ? [figure(100 * metres), "", "pose sigma", "cm"] : [figure(metres), "", "pose sigma", "m"]);
@@ -151,7 +113,7 @@ function show() {
   cells.health.cell.title = healthFigures();
   cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has the times of the run.";
   cells.rate.cell.title = "Scans that were mapped in a second, over the last 20 of them";
-  cells.data.cell.title = "Time since the newest scan of the robot came. Link: scans that the network lost. Mapping: scans that came and are not in the map, because mapping was behind or they could not be read";
+  cells.data.cell.title = "Time since the newest scan of the robot came, while paused since one was mapped. Link: scans that the network lost. Mapping: scans that came and are not in the map, because mapping was behind or they could not be read";
   cells.behind.cell.title = "Scans that wait to be mapped";
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
@@ -197,10 +159,10 @@ function showState() {
   showRecording(state.status?.recording ?? "", state.connected);
   document.body.classList.toggle("lost", !state.connected && state.lostAt > 0);
   const quiet = isOld(), silence = silenceOf(state.status);
-  byId("figures").classList.toggle("old", quiet || silence !== null);
-  document.body.classList.toggle("stale", silence !== null);
+  const isStale = silence !== null && !silence.isChosen; // a paused map can be read and annotated
+  byId("figures").classList.toggle("old", quiet || isStale);
+  document.body.classList.toggle("stale", isStale);
   showNotice(quiet, silence);
-  showWay();
 }
 
 // The file and its size, or why there is none. A press on a recording ends it, another press begins the next one.
@@ -240,52 +202,10 @@ const askToEnd = atSecondPress((asks) => { isAsking = asks; showState(); }, () =
 }));
 export const pressRecording = edits(() => (isRecording() ? askToEnd() : attempted(() => command("record"))));
 
-// Whether a run plays and no message came for a while.
-function isOld() {
-  const now = performance.now(), patience = (now - compiledAt < COMPILED_FOR ? 4 : 1) * OLD_AFTER;
-  return state.status?.state === "playing" && now - state.heardAt > patience;
-}
-
-// Obstacles ahead of the robot, a silence of it or a lost pose, below the strip so that nothing moves. A screen reader announces changes of the
-// zone, not of the distance or the duration.
-const way = byId("way");
-const WAY = { slow: "▲ Slow: obstacle", stop: "■ Stop: obstacle", unknown: "? Path ahead not visible to the sensor" };
-
-function showWay() {
-  const clearance = state.map?.clearance, silence = silenceOf(state.status);
-  // Only a robot that drives on has something in its way, and only a scan of now shows it.
-  const quiet = [...NO_FIGURES, "finished", "waiting"].includes(state.status?.state) || !state.connected || isOld()
-    || (state.status?.live && state.status.state === "paused"); // the robot drives on
-  const obstacle = !silence && !quiet && WAY[clearance?.zone] ? clearance : null;
-  const poseLost = !silence && !quiet && state.status?.live && held.state === "lost" && obstacle?.zone !== "stop";
-  const text = silence ? `■ ${silence.what}` : poseLost ? "■ Pose lost" : obstacle && WAY[obstacle.zone];
-  way.hidden = !text;
-  way.dataset.zone = silence ? (isLoud(silence) ? "silent" : "slow") : poseLost ? "lost" : clearance?.zone ?? "";
-  showObstacle(obstacle && state.map.obstacle ? { ...state.map.obstacle, zone: obstacle.zone } : null);
-  const [zone, distance, why] = way.children;
-  if (text) setText(zone, text);
-  setText(distance, silence ? ` for ${silence.for_s} s` : obstacle && !poseLost && obstacle.zone !== "unknown" ? ` ${figure(obstacle.ahead_m)} m ahead` : "");
-  setText(why, silence ? silence.why : poseLost ? capital(held.reason) : "");
-  // Until a person of this browser has seen the setting.
-  byId("way-sound").hidden = !state.status?.live || !["stop", "silent", "lost"].includes(way.dataset.zone) || byId("alarm-sound").checked || recall("alarm-sound") !== null;
-  // An open dialog covers everything outside of it.
-  const place = [...document.querySelectorAll("dialog:modal")].at(-1) ?? document.querySelector(".strip");
-  if (way.parentElement !== place) place.append(way);
-}
-
-// The map draws it as long as it is reported.
-function showObstacle(obstacle) {
-  const hasChanged = obstacle?.zone !== state.obstacle?.zone;
-  state.obstacle = obstacle;
-  if (hasChanged) changed("obstacle");
-}
-
 let ahead = null; // [ms] of the server's clock before that of this machine; null while unknown
-let compiledAt = -Infinity; // when the server last reported compiling [ms]
 
 function compilingFor({ compiling_since_s: since, compiled, kernels_left: left }) {
   if (!since) return "";
-  compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
   if (!(compiled < 1)) return passed < 10 ? "" : `. ${passed} s so far.`;
@@ -335,14 +255,11 @@ function showNotice(quiet, silence) {
   setText(byId("notice-open"), isUnheard ? "Change address" : "Open another run");
 }
 
-const seconds = (since) => Math.floor((performance.now() - since) / 1000);
-
 export function startStatus() {
+  startWay();
   byId("recording").addEventListener("click", pressRecording);
   build();
   on("status map evaluation annotations truth", show);
-  on("status map", showWay);
-  document.addEventListener("toggle", showWay, true); // of dialogs
   on("status connection", showState);
   setInterval(() => { showState(); show(); }, 1000);
 }

@@ -306,6 +306,14 @@ async def test_a_silence_of_a_robot_is_logged_with_the_time_of_its_last_scan(das
     text = "Nothing heard: the robot is gone"  # the event has its own duration
     assert last == {"t": 0.0, "kind": "silence", "text": text, "for_s": None}
     assert told["start_s"] == pytest.approx(1e-9 * frame(0, 0).stamp_ns)
+    paused = replace(silent, state="paused", health="no data for 9 s")
+    for status, kinds in (
+        (paused, ["silence", "pause"]),
+        (replace(paused, health="good"), ["silence", "pause", "silence"]),
+        (silent, ["silence", "pause", "silence", "pause", "silence"]),
+    ):
+        await dashboard.receive(Report(status))
+        assert [each["kind"] for each in browser_knows(dashboard)["events"]["events"]] == kinds
     recording = replace(silent, recording="recording a.mcap, 2 MB", recorded_file="/a.mcap")
     await dashboard.receive(Report(recording))
     told = browser_knows(dashboard)["events"]["events"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -134,14 +135,68 @@ def test_a_sensor_with_a_scan_in_five_seconds_is_not_silent_between_them():
     assert lasting(events) == [(15.0, "silence", 45.0)]
 
 
-def test_a_recording_is_logged_and_outlasts_a_silence():
+class Clock:
+    """Stands in for the module `time`."""
+
+    def __init__(self, now: float) -> None:
+        self.now = now
+
+    def time(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock of this computer at 1000 s."""
+    made = Clock(1000.0)
+    monkeypatch.setattr("app.dashboard.events.time", made)
+    return made
+
+
+def test_a_link_that_stalls_is_silent_by_the_clock_of_the_reader(clock: Clock):
+    events = Events()
+    events.shown(seen(0, 0), 5.0)
+    events.silent("Nothing heard for 2 s: /scan is announced and silent", 5.0, 2.0)
+    clock.now = 1020.0
+    events.shown(seen(1, 0), 5.1)  # the link delivers what it held back
+    silence, again = events.as_plain()["events"]
+    assert (silence["t"], silence["noted_s"], silence["for_s"]) == (5.0, 998.0, 22.0)
+    assert (again["t"], again["noted_s"], again["text"]) == (5.1, 1020.0, "Data again")
+
+
+def test_a_pause_is_logged_with_the_silences_in_it_and_ends_a_stop(clock: Clock):
+    events = Events()
+    stopped = replace(seen(0, 0), clearance=Clearance(Zone.STOP, ahead=0.8))
+    events.shown(stopped, 4.0)
+    assert events.paused(True, 5.0)
+    assert not events.paused(True, 5.0)
+    for began, ended in ((1010.0, 1030.0), (1040.0, 1050.0)):
+        clock.now = began
+        assert events.silent("gone", 5.0, 1.0)
+        clock.now = ended
+        assert events.heard(5.0)
+        assert not events.heard(5.0)
+    clock.now = 1060.0
+    assert events.paused(False, 5.0)
+    events.shown(stopped, 65.0)
+    assert lasting(events) == [
+        (4.0, "stop", 1.0),
+        (5.0, "pause", 60.0),
+        (5.0, "silence", 21.0),
+        (5.0, "silence", 11.0),
+        (65.0, "stop", None),
+    ]
+
+
+def test_a_recording_is_logged_and_outlasts_a_silence(clock: Clock):
     events = Events()
     assert not events.recorded("", "", 0.0)
     assert events.recorded("recording a.mcap, 0 MB", "/a.mcap", 1.0)
     events.silent("Nothing heard for 2 s: the robot is gone", 3.0)
     assert not events.recorded("finishing a.mcap", "/a.mcap", 4.0)
+    clock.now += 8.0  # it goes on while the run is paused
     assert events.recorded("recorded a.mcap, 3 MB", "/a.mcap", 6.0)
-    assert lasting(events)[0] == (1.0, "recording", 5.0)
+    assert lasting(events)[0] == (1.0, "recording", 8.0)
     told = [(1.0, "recording", "Recording: /a.mcap"), (6.0, "recording", "Recorded a.mcap, 3 MB: /a.mcap")]
     assert [mark for mark in marks(events) if mark[1] == "recording"] == told
 

@@ -331,6 +331,20 @@ def test_a_paused_run_is_recorded(sending, tmp_path: Path):
     assert recorded_scans(tmp_path / "run.mcap") == 11 + 3 * (SCANS - 11)
 
 
+def test_the_status_of_a_paused_run_follows_its_robot(sending):
+    with stage() as on:
+        link = mapped_link(on, sending)
+        on.commands.put(Pause())
+        until(lambda: on.status.state == "paused")
+        link.silence_s = 7.0
+        until(lambda: on.status.health == "no data for 7 s")
+        age_s = on.status.map_age_s
+        sending(link, 11, SCANS)
+        until(lambda: on.status.health != "no data for 7 s")
+        assert (on.status.state, on.status.detail) == ("paused", "")
+        assert on.status.map_age_s > age_s, "the map grows older although scans arrive"
+
+
 def test_what_arrives_while_kernels_compile_is_recorded_and_reported(sending, tmp_path: Path):
     with stage() as on:
         on.compiled.clear()

@@ -245,6 +245,15 @@ async def test_opening_tells_the_worker(both: Running) -> None:
     assert (await client.get("/api/status")).json()["state"] == "starting"
 
 
+async def test_a_source_is_checked_without_leaving_the_run(both: Running) -> None:
+    client, dashboard = both
+    before, status = len(told(dashboard)), dashboard.status
+    path = "/api/open?check_only=true"
+    assert (await client.post(path, json={"uri": "sim:slope"})).status_code == 202
+    assert (await client.post(path, json={"uri": "sim:nowhere"})).status_code == 409
+    assert (len(told(dashboard)), dashboard.status) == (before, status)
+
+
 async def test_a_live_run_is_recorded_to_a_new_file_in_the_data_folder(tmp_path: Path) -> None:
     async with running(Settings(folder=tmp_path)) as (client, dashboard):
         client.headers.update(BEARER)

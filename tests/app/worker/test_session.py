@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.worker.protocol import Open, Status
+from app.worker.protocol import Open, State, Status
 from app.worker.run import reflectance_of
 from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
@@ -531,21 +531,28 @@ def test_status_counts_the_scans_that_are_left_out() -> None:
     assert session.status().scans_left_out == 5
 
 
-@pytest.mark.parametrize(("waiting", "state"), [(0, "waiting"), (3, "playing")])
-def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str) -> None:
+@pytest.mark.parametrize(
+    ("before", "waiting", "state", "is_silent"),
+    [("playing", 0, "waiting", True), ("playing", 3, "playing", False), ("paused", 3, "paused", True)],
+)
+def test_a_robot_whose_scans_wait_is_not_called_silent_unless_it_is_paused(
+    before: State, waiting: int, state: str, is_silent: bool
+) -> None:
     robot = SimpleNamespace(
         waiting_for=lambda: "Nothing heard for 3 s",
         scans_waiting=waiting,
         silence_s=3.0,
+        map_age_s=7.0,
         robot="a",
         robots=["a"],
         recording="",
         recorded_file="",
         losses={"scans lost on the network": 3, "scans skipped because mapping was behind": 162},
     )
-    told = with_robot(Status(state="playing", source="zenoh:"), cast(Any, robot))
-    assert (told.state, told.detail) == (state, "" if waiting else "Nothing heard for 3 s")
-    assert (told.silence_s, told.scans_lost) == (3.0, 3)
+    told = with_robot(Status(state=before, source="zenoh:", scan_index=5), cast(Any, robot))
+    assert (told.state, told.detail) == (state, "Nothing heard for 3 s" if is_silent else "")
+    assert (told.health == "no data for 3 s") == is_silent
+    assert (told.silence_s, told.map_age_s, told.scans_lost) == (3.0, 7.0, 3)
 
 
 def test_a_source_without_a_mapper_is_closed() -> None:
