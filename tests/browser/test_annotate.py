@@ -830,6 +830,9 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     person.card_shown()
     page.keyboard.press("Shift+P")
     person.until_server("/api/annotations", "it.trees.some(row => row.kind === 'pole')")
+    # The doubt is not repeated: the diameter was confirmed.
+    said = f"Tree {first['number']}: pole, 2.6 cm (before: tree, 2.6 cm)"
+    expect(last.locator("span")).to_have_text(said)
     canvas.press("Control+z")
     expect(page.locator("#problem")).to_contain_text(
         f"Undone: the answer pole, 2.6 cm of tree {first['number']}."

@@ -41,7 +41,7 @@ export const draft = {
   kind: null, // chosen class of a rejected tree, see `rejectedKind`
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
   shownAt: Infinity, // [ms] time since which it is on the screen
-  answer: null, // see `answerOf`, if the last edit stated something about a tree
+  answer: null, // {number, kind, dbh, before, isStored}: what the last edit stated about a tree, and its annotation before
   answered: [], // ids of the annotations of the last answers, the newest last
   error: "",
   refused: "", // why the last answer did not count
@@ -158,7 +158,7 @@ function latest({ id, version }) {
 export function change(row, fields) {
   const tree = treeOf(treeNumberOf(row)), { x, y, kind, dbh_cm } = { ...row, ...fields };
   const isAnswer = tree && x === row.x && y === row.y;
-  return edit(() => patched(row, fields), isAnswer ? { ...answerOf(tree, kind, dbh_cm), before: row, isAsked: "dbh_cm" in fields } : null);
+  return edit(() => patched(row, fields), isAnswer ? { number: tree.number, kind, dbh: dbh_cm, before: row } : null);
 }
 
 async function patched(row, fields) {
@@ -399,7 +399,7 @@ export const byClick = (answers) => (event) => {
 
 async function answer(tree, kind, fields = {}, goesOn = true) {
   const { number } = tree, seen = annotationOf(tree), run = state.annotations?.run;
-  const { dbh_cm = null } = { ...seen, ...fields }, given = { ...answerOf(tree, kind, dbh_cm), before: seen, isAsked: "dbh_cm" in fields };
+  const { dbh_cm = null } = { ...seen, ...fields }, given = { number, kind, dbh: dbh_cm, before: seen };
   Object.assign(draft, { kind: null, refused: "" });
   if (seen && Object.entries({ kind, ...fields }).every(([name, value]) => seen[name] === value)) {
     draft.answer = { ...given, isStored: true };
@@ -514,16 +514,13 @@ function keepAnswered(id) {
   remember(`answered.${state.annotations.run}`, JSON.stringify(draft.answered), "sessionStorage");
 }
 
-// What an edit states about a tree, and the diameter that the map had then.
-const answerOf = ({ number, dbh_cm: mapped, sigma_dbh_cm: sigma }, kind, dbh) => ({ number, kind, dbh, mapped, sigma });
-
 const statement = (kind, dbh) => (dbh === null ? kind : `${kind}, ${dbh} cm`);
 
 // What the last edit said about a tree ("Tree 40: tree, 31.5 cm"); "" if it said nothing about one.
 export function answerText() {
   if (!draft.answer) return "";
   const { number, kind, dbh, isStored } = draft.answer;
-  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${replacedText(draft.answer)}${draft.answer.isAsked ? "" : dbhDoubt(draft.answer)}`;
+  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${replacedText(draft.answer)}`;
 }
 
 // The answer that this one replaced, with the name of another person.
@@ -534,14 +531,12 @@ function replacedText({ before, kind, dbh, isStored }) {
 
 export const byOther = (row) => (row.who === myName() ? "" : ` by ${row.who}`);
 
-// Why a DBH that is typed for a found tree [cm] is doubtful; "" if it is not.
-export const typedDoubt = (tree, dbh) => dbhDoubt(answerOf(tree, "tree", dbh)).replace("; the", "The");
-
-// A typed diameter that differs from that of the map by more than chance is often one in another unit.
-function dbhDoubt({ dbh, mapped, sigma }) {
+// Why a DBH that is typed for a found tree [cm] is doubtful; "" if it is not. One that differs from that of the map by more than
+// chance is often in another unit.
+export function typedDoubt({ dbh_cm: mapped, sigma_dbh_cm: sigma }, dbh) {
   if ([dbh, mapped, sigma].includes(null)) return "";
   const isNear = Math.abs(dbh - mapped) <= MOST_SIGMAS * Math.hypot(sigma, state.annotations?.tape_sigma_cm ?? 0);
-  return isNear ? "" : `; the map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
+  return isNear ? "" : `The map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
 }
 
 // --- the chosen annotation -------------------------------------------------------------------------------------
