@@ -608,7 +608,7 @@ def test_the_name_is_asked_until_it_is_given_and_stored_with_answers(person: Das
     expect(page.locator("#review-title")).to_have_text(f"Tree {second['number']}")
     person.answer("Shift+P")
     person.until_server("/api/annotations", "it.trees.length === 2 && it.trees[1].who === 'Ann'")
-    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table))"
+    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table, ''))"
     page.evaluate(imported, f"x_m,y_m,class\n{other['x']},{other['y']},tree\n")
     expect(page.locator("#annotations tbody tr")).to_have_count(3)
     # The answers before the name are there, and rows that this person imported are no answers.
@@ -889,7 +889,7 @@ def test_the_map_names_the_source_of_class_and_dbh(person: Dashboard):
         if sum((each["x"] - o["x"]) ** 2 + (each["y"] - o["y"]) ** 2 < 4.0 for o in truth) == 1
     ]
     confirmed, measured, other = sorted(alone, key=lambda each: each["x"] ** 2 + each["y"] ** 2)[:3]
-    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table))"
+    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table, ''))"
     table = f"{confirmed['x']},{confirmed['y']},\n{measured['x']},{measured['y'] + 0.1},2.6\n"
     page.evaluate(imported, f"x_m,y_m,dbh_cm\n{table}")
     person.until_server("/api/annotations", "it.trees.length === 2")

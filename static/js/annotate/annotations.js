@@ -240,7 +240,7 @@ function changeText({ was, is }, tree) {
   if (is.dbh_cm !== was.dbh_cm) return `DBH of ${name} ${is.dbh_cm === null ? "removed" : `set to ${is.dbh_cm} cm`}`;
   return `${name} moved`;
 }
-export const importTable = (table, unit, replaces) => edit(() => call("POST", "/import", { table, replaces, dbh_unit: unit || null }));
+export const importTable = (table, file, unit, replaces) => edit(() => call("POST", "/import", { table, file: file.slice(0, 300), replaces, dbh_unit: unit || null }));
 
 // --- review of the found trees -------------------------------------------------------------------------------
 
@@ -489,7 +489,7 @@ export function previous() {
 
 // The last trees of the map that were answered in this window, the newest last; those whose answer was undone are open again. The ids
 // of their annotations are kept until the window is closed: a rerun changes the numbers of trees, and `who` of an annotation changes
-// when the person gives a name and is also that of imported ones.
+// when the person gives a name and may also be that of imported ones.
 export function answeredTrees() {
   const stored = draft.answered.map((id) => treeNumberOf({ id })).filter((number) => !answering.has(number));
   return [...new Set([...stored, ...answering])].map(treeOf).filter(Boolean);
