@@ -344,6 +344,35 @@ PRESSES = """async ([key, number, wait, held]) => {
 }"""
 
 
+# How the answers look when a card comes into view: whether they are disabled, and their places.
+ANSWERS_LOOK = """() => ['yes', 'no', 'next'].map((name) => {
+  const button = document.getElementById(`annotate-${name}`);
+  const { x, y, width, height } = button.getBoundingClientRect();
+  return [button.getAttribute('aria-disabled'), x, y, width, height];
+})"""
+CARD_COMES = """async () => {
+  const { draft, news } = await import('/static/js/annotate/annotations.js');
+  draft.shownAt = performance.now();
+  news();
+}"""
+
+
+def test_the_answers_show_whether_they_count(person: Dashboard):
+    page = person.page
+    tree = doubted(person)[0]
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({tree['number']}))")
+    person.card_shown()
+    page.evaluate(CARD_COMES)
+    waiting = page.evaluate(ANSWERS_LOOK)
+    assert [disabled for disabled, *_ in waiting] == ["true"] * 3
+    for name in ("yes", "no", "next"):
+        expect(page.locator(f"#annotate-{name}")).to_have_attribute("aria-disabled", "false")
+    assert [place for _, *place in page.evaluate(ANSWERS_LOOK)] == [place for _, *place in waiting]
+    page.locator("#map").press("y")
+    person.until_server("/api/annotations", "it.trees.length === 1")
+    expect(page.locator("#review-refused")).to_be_hidden()
+
+
 def test_a_held_key_and_keys_faster_than_a_look_answer_for_no_unseen_tree(person: Dashboard):
     page = person.page
     page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
@@ -1266,6 +1295,24 @@ def test_a_rejection_does_not_pass_to_a_neighbour_when_its_tree_is_gone(person: 
     assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.5]) == ["rejected", 0, ""]
     said = "1 answer belongs to no tree of this map, so it decides nothing:"
     assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.25]) == ["open", 1, said]
+
+
+# 14 rejections of things that this map has not.
+MANY_WITHOUT_TREE = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const same = { y: 900, kind: 'pole', dbh_cm: null, reach_m: 0.5, who: 'Ann', at_s: 0, version: 1 };
+  const row = (id) => ({ ...same, id, x: id });
+  state.annotations = { ...state.annotations, trees: Array.from({ length: 14 }, (_, k) => row(1e6 + k)) };
+  changed('annotations');
+}"""
+
+
+def test_a_long_list_says_how_many_more_there_are(person: Dashboard):
+    person.page.evaluate(MANY_WITHOUT_TREE)
+    listed = person.page.locator("#annotate-without [role=group]")
+    expect(listed.get_by_role("button")).to_have_count(12)
+    expect(listed).to_contain_text("and 2 more")
+    person.page.reload()
 
 
 def test_an_answer_that_replaces_that_of_another_person_says_so(

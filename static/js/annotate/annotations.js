@@ -359,9 +359,14 @@ async function answerIfSeen(tree, kind) {
     showCard();
     draft.shownAt = performance.now();
     refuse(`the card of tree ${number} was out of view`);
-  } else if (performance.now() - draft.shownAt < LOOK) refuse(`tree ${number} had only just come into view`);
-  else if (state.selectedElsewhere && performance.now() - draft.shownAt < LOOK_UNASKED) refuse(`tree ${number} was selected elsewhere a moment ago`);
+  } else if (readyIn(tree)) refuse(`tree ${number} ${state.selectedElsewhere ? "was selected elsewhere a moment ago" : "had only just come into view"}`);
   else await answer(tree, kind);
+}
+
+// [ms] until the selected tree can be answered; Infinity while its card loads or the answer before is on its way.
+export function readyIn({ number }) {
+  if (answering.has(number) || draft.shown !== number) return Infinity;
+  return Math.max(0, draft.shownAt + (state.selectedElsewhere ? LOOK_UNASKED : LOOK) - performance.now());
 }
 
 const REFUSED_FOR = 5000; // [ms] as long as a message of the page: the picture below is to be looked at

@@ -227,16 +227,17 @@ function fillHistory() {
     ...shown.map((tree) => el("button", { class: "quiet small", type: "button", "aria-pressed": String(tree.number === state.selected), text: `${tree.number} ${classOf(tree)}`, title: `Show tree ${tree.number} again`, onclick: () => lookAt(tree) })));
 }
 
-// Buttons that choose annotations, the first ones of many.
+// Buttons that choose annotations, the first ones of many, and how many more there are.
 function fillRows(box, annotations) {
-  const shown = annotations.slice(0, MOST_LISTED), now = JSON.stringify([shown.map((row) => [row.id, row.kind, treeNumberOf(row)]), draft.chosen]);
+  const shown = annotations.slice(0, MOST_LISTED), more = annotations.length - shown.length;
+  const now = JSON.stringify([more, shown.map((row) => [row.id, row.kind, treeNumberOf(row)]), draft.chosen]);
   box.hidden = !shown.length;
   if (box.dataset.now === now) return; // the focus stays on a button
   box.dataset.now = now;
   box.replaceChildren(...shown.map((row) => {
     const number = treeNumberOf(row), place = placeTexts([row.x, row.y]).join(", ");
     return el("button", { class: "quiet small", type: "button", "aria-pressed": String(row.id === draft.chosen), text: `${number === null ? `at ${place}` : number} ${row.kind}`, title: `Select it: ${row.kind} by ${row.who} at ${place}`, onclick: () => { choose(row.id); showCard(); } });
-  }));
+  }), more ? el("span", { text: `and ${more} more` }) : "");
 }
 
 const classOf = (tree) => annotationOf(tree)?.kind ?? "…"; // its answer is on its way
