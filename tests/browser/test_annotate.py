@@ -1072,6 +1072,44 @@ def test_two_annotators_get_different_trees_and_a_page_on_another_tab_follows(
     assert person.errors == []
 
 
+# Next, before the message on the selection of the other page has come.
+NEXT_BEFORE_MESSAGE = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const { skip } = await import('/static/js/annotate/annotations.js');
+  state.selectedByOthers = [];
+  changed('others'); // it has left no tree either
+  changed('annotations');
+  await skip();
+  return state.selected;
+}"""
+
+
+def test_of_two_annotators_who_come_to_one_tree_at_once_the_second_goes_on(
+    person: Dashboard, chromium: Browser, server: Server
+):
+    first, second, *_ = doubted(person)
+    title = person.page.locator("#review-title")
+    with opened_by_another(chromium, server.link) as other:
+        other.tab("Annotate")
+        person.page.evaluate("import('/static/js/core/live_feed.js').then(it => it.select(null))")
+        select = "number => import('/static/js/core/live_feed.js').then(it => it.select(number))"
+        other.page.evaluate(select, first["number"])
+        held = "() => import('/static/js/core/store.js').then(({ state }) => state.selectedByOthers)"
+        person.eventually(
+            lambda: person.page.evaluate(held) == [first["number"]], lambda: person.page.evaluate(held)
+        )
+        assert person.page.evaluate(NEXT_BEFORE_MESSAGE) == first["number"]
+        expect(title).to_have_text(f"Tree {second['number']}")
+        expect(other.page.locator("#review-title")).to_have_text(f"Tree {first['number']}")
+        # Who chooses a tree that another page has stays there.
+        person.page.evaluate(select, first["number"])
+        person.answer("y")
+        expect(person.page.locator("#review-last")).to_contain_text(f"Tree {first['number']}: tree")
+        person.until_server("/api/annotations", "it.trees.length === 1 && it.skipped.length === 0")
+        assert other.errors == []
+    assert person.errors == []
+
+
 # The next tree of the review after another page has selected a tree, has left it, and its answer has come.
 NEXT_BESIDE_ANOTHER = """async (number) => {
   const { state, changed } = await import('/static/js/core/store.js');

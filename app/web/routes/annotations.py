@@ -353,7 +353,7 @@ def _when(row: dict[str, Any]) -> str:
 def _faults(content: Content) -> Iterator[SourceError]:
     """Yield what of a row of a table an annotation cannot have."""
     if abs(content.x) > FARTHEST_M or abs(content.y) > FARTHEST_M:
-        yield SourceError(f"it is farther than {FARTHEST_M:.0f} m from the origin")
+        yield SourceError(f"it is farther than {FARTHEST_M:,.0f} m from the origin")
     if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
         yield SourceError(f"the DBH is {content.dbh:.1f} m", remedy="Check the unit of the diameter")
     if content.who and not is_user_name(content.who):

@@ -460,7 +460,17 @@ export async function skip() {
 // The order needs the votes: a key pressed before they have arrived waits for them.
 async function next() {
   if (!votes.known) await updateVotes.now();
-  lookAt(following()[0]);
+  const [tree] = following();
+  lookAt(tree);
+  offered = tree && !isSelectedByOther(tree) ? tree.number : null;
+}
+
+// Two people may come to one tree within the time of a message: it is left to whose selection came first.
+let offered = null; // number of the tree to which the review came, until the server tells whose selection was the first
+function giveWay() {
+  if (state.isOtherFirst === null || state.selected !== offered) return;
+  offered = null;
+  if (state.isOtherFirst) next();
 }
 
 // Shows a tree in the review; none stays where the review is.
@@ -637,6 +647,7 @@ export function startAnnotating() {
   on("annotations map selection", keepOneSelection);
   on("selection", forgetTreeBefore);
   on("others", noteOthers);
+  on("others", giveWay);
   on("annotations", () => leftByOthers.clear());
   on("tab", () => {
     state.keepsSelection = annotating() || visible("repair");

@@ -222,7 +222,7 @@ export function fillCard() {
   }
   setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
   setText(byId("review-state"), `${review === "rejected" ? `rejected: ${annotationOf(tree).kind}` : review}${["open", "skipped"].includes(review) ? "" : byOther(annotationOf(tree))}`);
-  byId("review-state").dataset.state = review;
+  Object.assign(byId("review-state"), { title: byId("review-state").textContent }).dataset.state = review;
   for (const id of ["review", "review-more"]) byId(id).classList.toggle("loading", old);
   byId("review").setAttribute("aria-busy", String(old));
   fillDbh(tree);

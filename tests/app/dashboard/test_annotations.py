@@ -356,7 +356,7 @@ async def test_all_faults_of_a_table_are_named(both: Running) -> None:
     refused = (await edit(client, "POST", "/import", table=faulty)).json()["error"]
     assert refused["what"] == (
         "line 2: x_m = 'up' is not a number; line 2: class 'shrub' is not one of tree, pole, person, bush, "
-        "other, hidden; line 4: it is farther than 10000000 m from the origin; line 4: the DBH is 20.0 m; "
+        "other, hidden; line 4: it is farther than 10,000,000 m from the origin; line 4: the DBH is 20.0 m; "
         "line 4: who = '=cmd()' is not a name"
     )
     assert refused["remedy"] == "Check the unit of the diameter"
