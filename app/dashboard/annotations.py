@@ -395,6 +395,7 @@ class ImportPlan:
         filled, replaced: Id, version and new content of each annotation that gets a DBH, and of each one
             whose class or DBH is replaced.
         conflicts: The annotation and the row that contradicts it, of each row that is left out for that.
+            Other contents have their author, empty if the row names none or that of the annotation.
         repeated: Number of rows that say nothing new.
         beside: Distance between row and annotation [m], of each row that is about an annotation but not at
             its place.
@@ -409,7 +410,11 @@ class ImportPlan:
 
 
 def import_plan(
-    rows: Sequence[Annotation], contents: Sequence[Content], *, replaces: bool = False
+    rows: Sequence[Annotation],
+    contents: Sequence[Content],
+    *,
+    replaces: bool = False,
+    has_diameters: bool = False,
 ) -> ImportPlan:
     """Return what an import of a table does.
 
@@ -420,9 +425,11 @@ def import_plan(
 
     Args:
         rows: The annotations of objects.
-        contents: The rows of the table in the frame of the map.
+        contents: The rows of the table in the frame of the map, with their authors.
         replaces: Whether a row replaces the class and the DBH of its annotation, as after a correction of an
-            exported table elsewhere. An annotation keeps a DBH that the row lacks.
+            exported table elsewhere.
+        has_diameters: Whether the table has a column of diameters: then a row without DBH that replaces
+            removes the DBH of its annotation.
     """
     from scipy.spatial import cKDTree
 
@@ -438,17 +445,17 @@ def import_plan(
             object_of[k] = min(objects, key=lambda j: (known[j].kind != content.kind, j), default=k)
         j = object_of[k]
         here = known[j]
-        is_other_dbh = (
-            here.dbh is not None and content.dbh is not None and abs(here.dbh - content.dbh) > _SAME_DBH
-        )
+        dbh = content.dbh if content.dbh is not None or (replaces and has_diameters) else here.dbh
+        is_other_dbh = here.dbh is not None and (dbh is None or abs(here.dbh - dbh) > _SAME_DBH)
+        who = "" if j < len(rows) and content.who == rows[j].who else content.who
         if here.kind != content.kind or is_other_dbh:
             if replaces and j < len(rows) and j not in replaced | filled:
-                known[j] = replace(here, kind=content.kind, dbh=content.dbh or here.dbh)
+                known[j] = replace(here, kind=content.kind, dbh=dbh, who=who)
                 replaced.add(j)
             else:
                 conflicts.append((here, content))
-        elif here.dbh is None and content.dbh is not None:
-            known[j] = replace(here, dbh=content.dbh)
+        elif here.dbh is None and dbh is not None:
+            known[j] = replace(here, dbh=dbh, who=who)
             filled.add(j)
     added = [known[j] for j in range(len(rows), len(known)) if object_of[j] == j]
     edits: list[list[tuple[int, int, Content | None]]] = [

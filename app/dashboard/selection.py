@@ -309,13 +309,15 @@ class Selector:
             self._of_pages.clear()
         elif selection.tree is None:
             self._of_pages.pop(selection.by, None)
-        else:
-            self._of_pages[selection.by] = selection.tree
+        elif self._of_pages.get(selection.by) != selection.tree:
+            self._of_pages.pop(selection.by, None)
+            self._of_pages[selection.by] = selection.tree  # as the last one
         self._publish()
         self._dashboard.live.publish("missing", None)
 
     def _publish(self) -> None:
-        """Broadcast the selection with its `place`, the tree of each page that has selected one, and the
-        number of the run: a page that annotates does not keep a tree of the run before."""
+        """Broadcast the selection with its `place`, the tree of each page that has selected one, in the order
+        of these selections, and the number of the run: a page that annotates does not keep a tree of the run
+        before."""
         content = {"place": self._place, "pages": self._of_pages, "run": self._dashboard.run}
         self._dashboard.live.publish("selection", {**self.selection.as_plain(), **content})

@@ -53,6 +53,8 @@ class Content:
             fields of `Repair`, and of classes of extensions; None for KINDS and SKIPPED.
         reach: Distance below which a rejection can be about a mapped tree [m], because trees beyond were
             other ones when it was made; None if no other one was near, see `run_edits.reach_at`.
+        who: Author of a content that is stored, if it is not the author of the edit, as in an imported table;
+            else empty. Contents that are read have their author in `Annotation`.
     """
 
     x: float
@@ -61,6 +63,7 @@ class Content:
     dbh: float | None = None
     values: dict[str, Any] | None = None
     reach: float | None = None
+    who: str = field(default="", compare=False)
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:

@@ -679,13 +679,14 @@ class Store:
             author: Author of the edit.
             content: Content of the annotation.
         """
-        edit = {"who": author.who, "at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
-        id_ = _inserted(connection, insert(_annotations).values(run=run, **_columns(content), **edit))
+        stored = _columns(content, content.who or author.who)
+        edit = {"at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
+        id_ = _inserted(connection, insert(_annotations).values(run=run, **stored, **edit))
         values = {
             "step": step,
             "annotation": id_,
             "before": None,
-            "after": _columns(content),
+            "after": stored,
             "made_before": 0,
         }
         change = _inserted(connection, insert(_changes).values(**values))
@@ -707,8 +708,8 @@ class Store:
         values = {
             "step": step,
             "annotation": row.id,
-            "before": None if row.deleted else _columns(_content(row)),
-            "after": None if content is None else _columns(content),
+            "before": None if row.deleted else _columns(_content(row), row.who),
+            "after": None if content is None else _columns(content, content.who or author.who),
             "made_before": row.made_by,
         }
         change = _inserted(connection, insert(_changes).values(**values))
@@ -721,17 +722,14 @@ class Store:
 
         Args:
             connection: Connection with an open transaction.
-            who: Name of the author of the content.
+            who: Name of the author, unless the content has it.
             row: Present row of the annotation.
-            content: New content; None deletes the annotation.
+            content: New content, see `_columns`; None deletes the annotation.
             by: Number of the change that led to the content.
         """
-        edit = {"who": who, "at_ns": self._clock(), "version": row.version + 1, "made_by": by}
-        connection.execute(
-            update(_annotations)
-            .where(_annotations.c.id == row.id)
-            .values(**edit, deleted=content is None, **(content or {}))
-        )
+        edit = {"at_ns": self._clock(), "version": row.version + 1, "made_by": by}
+        values = {"who": who, **edit, "deleted": content is None, **(content or {})}
+        connection.execute(update(_annotations).where(_annotations.c.id == row.id).values(**values))
 
     # --- back and forth --------------------------------------------------------------------------
 
@@ -867,9 +865,11 @@ def _frame(connection: Connection, run: int) -> Row[Any] | None:
     ).one_or_none()
 
 
-def _columns(content: Content) -> dict[str, Any]:
-    """Return a content as values of the columns of annotations, as it is also stored in changes."""
+def _columns(content: Content, who: str) -> dict[str, Any]:
+    """Return a content and its author as values of the columns of annotations, as they are also stored in
+    changes; older changes have no author there, see `_author_of`."""
     return {
+        "who": who,
         "x": content.x,
         "y": content.y,
         "kind": content.kind,
@@ -904,7 +904,7 @@ def _inserted(connection: Connection, statement: Insert) -> int:
 
 
 def _author_of(connection: Connection, change: int) -> str | None:
-    """Return the name of the author of a change; None for the number of no change."""
+    """Return the name of the author of the step of a change; None for the number of no change."""
     steps = select(_steps.c.who).join(_changes, _changes.c.step == _steps.c.id)
     return connection.execute(steps.where(_changes.c.id == change)).scalar()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import csv
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,26 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
 from pipeline.io.readers.base import COORDINATE_LIMIT
+
+_MOST_NAMED = 10  # faults of a table that are named
+
+
+def refuse_faults(faults: Sequence[tuple[int, SourceError]]) -> None:
+    """Raise one error that names the faults of a table, in the order of the rows: the first 10 and how many
+    more there are. Return if there are none.
+
+    Args:
+        faults: Index of the row and error of each fault; its `what` names the line.
+
+    Raises:
+        SourceError: There is a fault. Remedies are those of the named faults.
+    """
+    errors = [error for _, error in sorted(faults, key=lambda fault: fault[0])]
+    named, more = errors[:_MOST_NAMED], len(errors) - _MOST_NAMED
+    if named:
+        what = "; ".join([*(error.what for error in named), *([f"and {more} more"] if more > 0 else [])])
+        remedies = dict.fromkeys(error.remedy for error in named if error.remedy)
+        raise SourceError(what, where=named[0].where, remedy=". ".join(remedies))
 
 
 def decoded(content: bytes) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.io.csv_table import CsvTable
+from pipeline.io.csv_table import CsvTable, refuse_faults
 from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.types.records import HIDDEN, Sensor, Truth, TruthPath, TruthTrees
 
@@ -27,9 +27,13 @@ _UNITS = {"cm": 0.01, "m": 1.0, "mm": 0.001}  # [m]
 #: Names of diameters with their units [m]; `bhd` is the German abbreviation.
 _DBH = {f"{name}_{unit}": metres for name in ("dbh", "bhd") for unit, metres in _UNITS.items()}
 _DBH_OF_UNKNOWN_UNIT = ("dbh", "bhd", "diameter")
+#: Names of columns of diameters.
+DBH_COLUMNS = (*_DBH, *_DBH_OF_UNKNOWN_UNIT)
 #: Range of the median diameter of a table [m]: from a seedling's to that of the thickest trees there are.
 _MEDIAN_DBH = (0.005, 3.0)
 _KIND = ("class", "kind", "type")
+#: Index of the row and error of each fault in a table, see `refuse_faults`.
+Faults = list[tuple[int, SourceError]]
 
 
 def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
@@ -47,47 +51,50 @@ def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
     Raises:
         SourceError: The file cannot be read, is larger than 8 MB, has no columns of positions or a class that
             is not one of KINDS, a number is invalid or beyond COORDINATE_LIMIT, the unit of diameters is
-            unknown, or their median is outside of 5 mm to 3 m.
+            unknown, or their median is outside of 5 mm to 3 m. The message names the first 10 lines with
+            faults.
     """
-    return _trees_of(CsvTable.read(path, "table of trees", LARGEST_FILE), dbh_unit)
+    faults: Faults = []
+    trees = truth_trees_of(CsvTable.read(path, "table of trees", LARGEST_FILE), faults, dbh_unit=dbh_unit)
+    refuse_faults(faults)
+    return trees
 
 
-def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> TruthTrees:
-    """Parse the text of a table as `read_truth_trees` does: positions and diameters [m], the latter NaN where
-    unknown, and classes. A header without rows gives no trees.
+def truth_trees_of(table: CsvTable, faults: Faults, *, dbh_unit: str | None = None) -> TruthTrees:
+    """Return the trees of a table as `read_truth_trees` does, a tree per row. A header without rows gives no
+    trees.
 
     Args:
-        text: The text.
-        where: Name of the table in messages.
-        dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit; None refuses such a column.
+        table: The table.
+        faults: The fault of each wrong cell is added: a class that is not one of KINDS, or a number that is
+            invalid or beyond COORDINATE_LIMIT, which is NaN in the result.
+        dbh_unit: As in `read_truth_trees`.
 
     Raises:
-        SourceError: As in `read_truth_trees`, except that no file is read.
+        SourceError: The table has no columns of positions, the unit of diameters is unknown, or their median
+            is outside of 5 mm to 3 m.
     """
-    return _trees_of(CsvTable(text, "table of trees", where), dbh_unit)
+    x, y = _positions(table, faults)
+    dbh = _diameters(table, dbh_unit, faults)
+    return TruthTrees(x, y, dbh, _kinds(table, faults))
 
 
-def _trees_of(table: CsvTable, dbh_unit: str | None) -> TruthTrees:
-    """Return the trees of a table; arguments as in `parse_truth_trees`.
-
-    Raises:
-        SourceError: As in `parse_truth_trees`.
-    """
-    x, y = _positions(table)
-    dbh = _diameters(table, dbh_unit)
-    return TruthTrees(x, y, dbh, _kinds(table))
+def _numbers(table: CsvTable, name: str, faults: Faults, *, required: bool = True) -> Float:
+    found: dict[int, SourceError] = {}
+    numbers = table.numbers(name, required=required, faults=found)
+    faults += found.items()
+    return numbers
 
 
-def _positions(table: CsvTable) -> tuple[Float, ...]:
+def _positions(table: CsvTable, faults: Faults) -> tuple[Float, ...]:
     """Return x and y of each row, shape (N,) [m], from columns of coordinates or of azimuth and distance.
 
     Raises:
-        SourceError: The table has neither of these columns, or a cell is not a number or beyond
-            COORDINATE_LIMIT.
+        SourceError: The table has neither of these columns.
     """
     x, y = table.find(_X), table.find(_Y)
     if x is not None and y is not None:
-        return table.numbers(x, required=True), table.numbers(y, required=True)
+        return _numbers(table, x, faults), _numbers(table, y, faults)
     azimuth, distance = table.find(_AZIMUTH), table.find(_DISTANCE)
     if azimuth is None or distance is None:
         raise SourceError(
@@ -96,30 +103,31 @@ def _positions(table: CsvTable) -> tuple[Float, ...]:
             remedy="Name the columns x_m and y_m, easting and northing, or azimuth_deg and distance_m; it "
             f"has {', '.join(table.column) or 'no header'}",
         )
-    angle = np.radians(table.numbers(azimuth, required=True))
-    reach = table.numbers(distance, required=True)
+    angle = np.radians(_numbers(table, azimuth, faults))
+    reach = _numbers(table, distance, faults)
     return reach * np.sin(angle), reach * np.cos(angle)
 
 
-def _diameters(table: CsvTable, dbh_unit: str | None) -> Float:
+def _diameters(table: CsvTable, dbh_unit: str | None, faults: Faults) -> Float:
     """Return diameters [m], shape (N,); NaN if there is no column of diameters, and for 0 and negative
     numbers.
 
     Args:
         table: The table.
         dbh_unit: Unit of a column whose name does not state it: "m", "cm" or "mm".
+        faults: See `truth_trees_of`.
 
     Raises:
-        SourceError: The unit is unknown, a cell is not a number, or the median is outside of _MEDIAN_DBH.
+        SourceError: The unit is unknown, or the median is outside of _MEDIAN_DBH.
     """
-    name = table.find((*_DBH, *_DBH_OF_UNKNOWN_UNIT))
+    name = table.find(DBH_COLUMNS)
     if name is None:
         return np.full(len(table.rows), np.nan)
     unit = _DBH.get(name) or _UNITS.get(dbh_unit or "")
     if unit is None:
         what = f"column {name!r} does not say its unit"
         raise SourceError(what, where=table.where, remedy="Give --dbh-unit m, cm or mm")
-    diameter = table.numbers(name, required=False) * unit
+    diameter = _numbers(table, name, faults, required=False) * unit
     known = diameter[diameter > 0.0]
     median = float(np.median(known)) if len(known) else 1.0
     if not _MEDIAN_DBH[0] <= median <= _MEDIAN_DBH[1]:
@@ -136,23 +144,17 @@ def _diameters(table: CsvTable, dbh_unit: str | None) -> Float:
     return np.where(diameter > 0.0, diameter, np.nan)
 
 
-def _kinds(table: CsvTable) -> tuple[str, ...]:
+def _kinds(table: CsvTable, faults: Faults) -> tuple[str, ...]:
     """Return the class of each row in lower case; "tree" for an empty cell, and for all rows if there is no
-    column of classes.
-
-    Raises:
-        SourceError: A class is not one of KINDS.
-    """
+    column of classes."""
     name = table.find(_KIND)
     if name is None:
         return ("tree",) * len(table.rows)
     kinds = tuple(text.lower() or "tree" for text in table.text(name))
     for row, kind in enumerate(kinds):
         if kind not in KINDS:
-            raise SourceError(
-                f"line {table.lines[row]}: class {kind!r} is not one of {', '.join(KINDS)}",
-                where=table.where,
-            )
+            what = f"line {table.lines[row]}: class {kind!r} is not one of {', '.join(KINDS)}"
+            faults.append((row, SourceError(what, where=table.where)))
     return kinds
 
 

@@ -344,6 +344,35 @@ PRESSES = """async ([key, number, wait, held]) => {
 }"""
 
 
+# How the answers look when a card comes into view: whether they are disabled, and their places.
+ANSWERS_LOOK = """() => ['yes', 'no', 'next'].map((name) => {
+  const button = document.getElementById(`annotate-${name}`);
+  const { x, y, width, height } = button.getBoundingClientRect();
+  return [button.getAttribute('aria-disabled'), x, y, width, height];
+})"""
+CARD_COMES = """async () => {
+  const { draft, news } = await import('/static/js/annotate/annotations.js');
+  draft.shownAt = performance.now();
+  news();
+}"""
+
+
+def test_the_answers_show_whether_they_count(person: Dashboard):
+    page = person.page
+    tree = doubted(person)[0]
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(it => it.select({tree['number']}))")
+    person.card_shown()
+    page.evaluate(CARD_COMES)
+    waiting = page.evaluate(ANSWERS_LOOK)
+    assert [disabled for disabled, *_ in waiting] == ["true"] * 3
+    for name in ("yes", "no", "next"):
+        expect(page.locator(f"#annotate-{name}")).to_have_attribute("aria-disabled", "false")
+    assert [place for _, *place in page.evaluate(ANSWERS_LOOK)] == [place for _, *place in waiting]
+    page.locator("#map").press("y")
+    person.until_server("/api/annotations", "it.trees.length === 1")
+    expect(page.locator("#review-refused")).to_be_hidden()
+
+
 def test_a_held_key_and_keys_faster_than_a_look_answer_for_no_unseen_tree(person: Dashboard):
     page = person.page
     page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
@@ -608,7 +637,7 @@ def test_the_name_is_asked_until_it_is_given_and_stored_with_answers(person: Das
     expect(page.locator("#review-title")).to_have_text(f"Tree {second['number']}")
     person.answer("Shift+P")
     person.until_server("/api/annotations", "it.trees.length === 2 && it.trees[1].who === 'Ann'")
-    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table))"
+    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table, ''))"
     page.evaluate(imported, f"x_m,y_m,class\n{other['x']},{other['y']},tree\n")
     expect(page.locator("#annotations tbody tr")).to_have_count(3)
     # The answers before the name are there, and rows that this person imported are no answers.
@@ -830,6 +859,9 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     person.card_shown()
     page.keyboard.press("Shift+P")
     person.until_server("/api/annotations", "it.trees.some(row => row.kind === 'pole')")
+    # The doubt is not repeated: the diameter was confirmed.
+    said = f"Tree {first['number']}: pole, 2.6 cm (before: tree, 2.6 cm)"
+    expect(last.locator("span")).to_have_text(said)
     canvas.press("Control+z")
     expect(page.locator("#problem")).to_contain_text(
         f"Undone: the answer pole, 2.6 cm of tree {first['number']}."
@@ -886,7 +918,7 @@ def test_the_map_names_the_source_of_class_and_dbh(person: Dashboard):
         if sum((each["x"] - o["x"]) ** 2 + (each["y"] - o["y"]) ** 2 < 4.0 for o in truth) == 1
     ]
     confirmed, measured, other = sorted(alone, key=lambda each: each["x"] ** 2 + each["y"] ** 2)[:3]
-    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table))"
+    imported = "table => import('/static/js/annotate/annotations.js').then(it => it.importTable(table, ''))"
     table = f"{confirmed['x']},{confirmed['y']},\n{measured['x']},{measured['y'] + 0.1},2.6\n"
     page.evaluate(imported, f"x_m,y_m,dbh_cm\n{table}")
     person.until_server("/api/annotations", "it.trees.length === 2")
@@ -1036,6 +1068,44 @@ def test_two_annotators_get_different_trees_and_a_page_on_another_tab_follows(
         number = title.inner_text().split()[1]
         row = other.page.locator(f"#trees tr[data-tree='{number}']")
         expect(row).to_have_attribute("aria-selected", "true")
+        assert other.errors == []
+    assert person.errors == []
+
+
+# Next, before the message on the selection of the other page has come.
+NEXT_BEFORE_MESSAGE = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const { skip } = await import('/static/js/annotate/annotations.js');
+  state.selectedByOthers = [];
+  changed('others'); // it has left no tree either
+  changed('annotations');
+  await skip();
+  return state.selected;
+}"""
+
+
+def test_of_two_annotators_who_come_to_one_tree_at_once_the_second_goes_on(
+    person: Dashboard, chromium: Browser, server: Server
+):
+    first, second, *_ = doubted(person)
+    title = person.page.locator("#review-title")
+    with opened_by_another(chromium, server.link) as other:
+        other.tab("Annotate")
+        person.page.evaluate("import('/static/js/core/live_feed.js').then(it => it.select(null))")
+        select = "number => import('/static/js/core/live_feed.js').then(it => it.select(number))"
+        other.page.evaluate(select, first["number"])
+        held = "() => import('/static/js/core/store.js').then(({ state }) => state.selectedByOthers)"
+        person.eventually(
+            lambda: person.page.evaluate(held) == [first["number"]], lambda: person.page.evaluate(held)
+        )
+        assert person.page.evaluate(NEXT_BEFORE_MESSAGE) == first["number"]
+        expect(title).to_have_text(f"Tree {second['number']}")
+        expect(other.page.locator("#review-title")).to_have_text(f"Tree {first['number']}")
+        # Who chooses a tree that another page has stays there.
+        person.page.evaluate(select, first["number"])
+        person.answer("y")
+        expect(person.page.locator("#review-last")).to_contain_text(f"Tree {first['number']}: tree")
+        person.until_server("/api/annotations", "it.trees.length === 1 && it.skipped.length === 0")
         assert other.errors == []
     assert person.errors == []
 
@@ -1263,6 +1333,24 @@ def test_a_rejection_does_not_pass_to_a_neighbour_when_its_tree_is_gone(person: 
     assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.5]) == ["rejected", 0, ""]
     said = "1 answer belongs to no tree of this map, so it decides nothing:"
     assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.25]) == ["open", 1, said]
+
+
+# 14 rejections of things that this map has not.
+MANY_WITHOUT_TREE = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  const same = { y: 900, kind: 'pole', dbh_cm: null, reach_m: 0.5, who: 'Ann', at_s: 0, version: 1 };
+  const row = (id) => ({ ...same, id, x: id });
+  state.annotations = { ...state.annotations, trees: Array.from({ length: 14 }, (_, k) => row(1e6 + k)) };
+  changed('annotations');
+}"""
+
+
+def test_a_long_list_says_how_many_more_there_are(person: Dashboard):
+    person.page.evaluate(MANY_WITHOUT_TREE)
+    listed = person.page.locator("#annotate-without [role=group]")
+    expect(listed.get_by_role("button")).to_have_count(12)
+    expect(listed).to_contain_text("and 2 more")
+    person.page.reload()
 
 
 def test_an_answer_that_replaces_that_of_another_person_says_so(

@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -17,6 +17,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from app.batch.run_edits import SAME_THING, annotation_of_tree, reach_at
+from app.common.user import is_user_name
 from app.dashboard.annotations import SAME_PLACE, Against, carried_back, import_plan, row_payload
 from app.dashboard.dashboard import Dashboard
 from app.store.records import (
@@ -74,12 +75,20 @@ class _Turn(Edit):
 
 
 class _ImportTable(Edit):
-    """A table of trees as text; `dbh_unit` is the unit of a column `dbh` whose header does not name it. With
-    `replaces` a row replaces the class and the diameter of its annotation, see `import_plan`."""
+    """A table of trees as text, and the name of its file; `dbh_unit` is the unit of a column `dbh` whose
+    header does not name it. With `replaces` a row replaces the class and the diameter of its annotation, see
+    `import_plan`."""
 
     table: Annotated[str, Field(max_length=1_000_000)]
+    file: Annotated[str, Field(max_length=300)] = ""
     replaces: bool = False
     dbh_unit: Literal["m", "cm", "mm"] | None = None
+
+    @property
+    def author(self) -> Author:
+        """The import: what a table states is no answer of the person who imports it."""
+        name = re.sub(r"[^\w .@-]", "_", self.file)
+        return Author(self.browser, f"import of {name}"[:40].rstrip() if name else "import")
 
 
 class _TruthChoice(Body):
@@ -170,19 +179,24 @@ async def redo(body: _Turn, dashboard: Dash) -> Response:
 @router.post("/annotations/import")
 async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     """Add the rows of a CSV table, and the diameters that annotations lack, in one edit, see `import_plan`.
+    The author of each is that of the row in a column `who`, else the import ("import of plot.csv"), also
+    where an annotation of the author of the row changes.
+
     Return the number of added annotations (`added`), of diameters added to others (`filled`), of annotations
     whose class or diameter is replaced (`replaced`), of rows that exist already as annotations or earlier in
     the table (`left_out`), and of rows that are left out because they contradict an annotation (`differing`),
     with the first of these as text (`differences`); of rows that are not exactly at the place of their
     annotation (`beside`), with the smallest and the largest distance (`beside_m`); and the counts of edits,
-    see `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows, 409 as in `add`;
-    then nothing is stored. Without anything new there is no edit."""
+    see `edited`. 422 if the table cannot be read or has too many rows or rows with faults, of which the first
+    10 are named, 409 as in `add`; then nothing is stored. Without anything new there is no edit."""
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
-    contents = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
+    contents, has_diameters = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
     if dashboard.shown is not None:
         await asyncio.to_thread(_check_unit, dashboard.shown.frame.trees, contents)
-    plan = import_plan(dashboard.annotation_editor.rows, contents, replaces=body.replaces)
+    plan = import_plan(
+        dashboard.annotation_editor.rows, contents, replaces=body.replaces, has_diameters=has_diameters
+    )
     changed = [*plan.filled, *plan.replaced]
     added = [replace(each, reach=_reach_at(dashboard, each.x, each.y)) for each in plan.added]
     if added or changed:
@@ -336,19 +350,14 @@ def _when(row: dict[str, Any]) -> str:
     return moment(round(row["at_s"] * 1e9))
 
 
-def _check(content: Content, row: int) -> None:
-    """Apply the bounds of a single annotation to a row of a table; raises BadRequestError outside of them.
-
-    Args:
-        content: The row.
-        row: Index of the row, from 0 on.
-    """
-    if max(abs(content.x), abs(content.y)) > FARTHEST_M:
-        raise BadRequestError(f"row {row + 1} is farther than {FARTHEST_M:.0f} m from the origin")
+def _faults(content: Content) -> Iterator[SourceError]:
+    """Yield what of a row of a table an annotation cannot have."""
+    if abs(content.x) > FARTHEST_M or abs(content.y) > FARTHEST_M:
+        yield SourceError(f"it is farther than {FARTHEST_M:,.0f} m from the origin")
     if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
-        raise BadRequestError(
-            f"row {row + 1} has a DBH of {content.dbh:.1f} m", remedy="Check the unit of the diameter"
-        )
+        yield SourceError(f"the DBH is {content.dbh:.1f} m", remedy="Check the unit of the diameter")
+    if content.who and not is_user_name(content.who):
+        yield SourceError(f"who = {content.who[:60]!r} is not a name")
 
 
 def _check_unit(trees: Trees, contents: list[Content]) -> None:
@@ -373,10 +382,10 @@ def _check_unit(trees: Trees, contents: list[Content]) -> None:
 
 def _imported(
     body: _ImportTable, offset: tuple[float, float], unit: tuple[float, float] = (1.0, 1.0)
-) -> list[Content]:
-    """Return the rows of an imported table in the frame of the map; raises BadRequestError if it cannot be
-    read, or a row or their number is out of bounds. A table of a file in feet may be in feet or in metres,
-    see `truth_in_metres`.
+) -> tuple[list[Content], bool]:
+    """Return the rows of an imported table in the frame of the map, with their authors where the table names
+    them, and whether it has a column of diameters; raises BadRequestError if it cannot be read, has too many
+    rows or rows with faults. A table of a file in feet may be in feet or in metres, see `truth_in_metres`.
 
     Args:
         body: The request.
@@ -384,19 +393,23 @@ def _imported(
         unit: Metres per unit of the reference system of the file, horizontal and vertical.
     """
     from app.batch.run_folder import truth_in_metres
-    from pipeline.io.ground_truth import parse_truth_trees
+    from pipeline.io.csv_table import CsvTable, refuse_faults
+    from pipeline.io.ground_truth import DBH_COLUMNS, Faults, truth_trees_of
 
+    faults: Faults = []
     try:
-        table = parse_truth_trees(
-            body.table.removeprefix("\ufeff"), where="the table", dbh_unit=body.dbh_unit
-        )
+        table = CsvTable(body.table.removeprefix("\ufeff"), "table of trees", "the table")
+        if len(table.rows) > MOST_ANNOTATIONS:
+            raise SourceError(f"a run can have at most {MOST_ANNOTATIONS} annotations")
+        trees = truth_in_metres(truth_trees_of(table, faults, dbh_unit=body.dbh_unit), unit, offset)
+        placed = contents_of(replace(trees, x=trees.x - offset[0], y=trees.y - offset[1]))
+        contents = [replace(each, who=who) for each, who in zip(placed, table.text("who"), strict=True)]
+        for k, content in enumerate(contents):
+            for fault in _faults(content):
+                what = f"line {table.lines[k]}: {fault.what}"
+                faults.append((k, SourceError(what, where=table.where, remedy=fault.remedy)))
+        refuse_faults(faults)
     except SourceError as error:
-        remedy = "Choose the unit of the diameter" if "unit" in error.what else error.remedy
+        remedy = "Choose the unit of the diameter" if "its unit" in error.what else error.remedy
         raise BadRequestError(error.what, where=error.where, remedy=remedy) from None
-    table = truth_in_metres(table, unit, offset)
-    contents = contents_of(replace(table, x=table.x - offset[0], y=table.y - offset[1]))
-    for line, content in enumerate(contents):
-        _check(content, line)
-    if len(contents) > MOST_ANNOTATIONS:
-        raise BadRequestError(f"a run can have at most {MOST_ANNOTATIONS} annotations")
-    return contents
+    return contents, table.find(DBH_COLUMNS) is not None

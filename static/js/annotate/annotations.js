@@ -41,7 +41,7 @@ export const draft = {
   kind: null, // chosen class of a rejected tree, see `rejectedKind`
   shown: null, // number of the tree whose evidence is on the card; the review answers for it
   shownAt: Infinity, // [ms] time since which it is on the screen
-  answer: null, // see `answerOf`, if the last edit stated something about a tree
+  answer: null, // {number, kind, dbh, before, isStored}: what the last edit stated about a tree, and its annotation before
   answered: [], // ids of the annotations of the last answers, the newest last
   error: "",
   refused: "", // why the last answer did not count
@@ -158,7 +158,7 @@ function latest({ id, version }) {
 export function change(row, fields) {
   const tree = treeOf(treeNumberOf(row)), { x, y, kind, dbh_cm } = { ...row, ...fields };
   const isAnswer = tree && x === row.x && y === row.y;
-  return edit(() => patched(row, fields), isAnswer ? { ...answerOf(tree, kind, dbh_cm), before: row, isAsked: "dbh_cm" in fields } : null);
+  return edit(() => patched(row, fields), isAnswer ? { number: tree.number, kind, dbh: dbh_cm, before: row } : null);
 }
 
 async function patched(row, fields) {
@@ -240,7 +240,7 @@ function changeText({ was, is }, tree) {
   if (is.dbh_cm !== was.dbh_cm) return `DBH of ${name} ${is.dbh_cm === null ? "removed" : `set to ${is.dbh_cm} cm`}`;
   return `${name} moved`;
 }
-export const importTable = (table, unit, replaces) => edit(() => call("POST", "/import", { table, replaces, dbh_unit: unit || null }));
+export const importTable = (table, file, unit, replaces) => edit(() => call("POST", "/import", { table, file: file.slice(0, 300), replaces, dbh_unit: unit || null }));
 
 // --- review of the found trees -------------------------------------------------------------------------------
 
@@ -359,9 +359,14 @@ async function answerIfSeen(tree, kind) {
     showCard();
     draft.shownAt = performance.now();
     refuse(`the card of tree ${number} was out of view`);
-  } else if (performance.now() - draft.shownAt < LOOK) refuse(`tree ${number} had only just come into view`);
-  else if (state.selectedElsewhere && performance.now() - draft.shownAt < LOOK_UNASKED) refuse(`tree ${number} was selected elsewhere a moment ago`);
+  } else if (readyIn(tree)) refuse(`tree ${number} ${state.selectedElsewhere ? "was selected elsewhere a moment ago" : "had only just come into view"}`);
   else await answer(tree, kind);
+}
+
+// [ms] until the selected tree can be answered; Infinity while its card loads or the answer before is on its way.
+export function readyIn({ number }) {
+  if (answering.has(number) || draft.shown !== number) return Infinity;
+  return Math.max(0, draft.shownAt + (state.selectedElsewhere ? LOOK_UNASKED : LOOK) - performance.now());
 }
 
 const REFUSED_FOR = 5000; // [ms] as long as a message of the page: the picture below is to be looked at
@@ -399,7 +404,7 @@ export const byClick = (answers) => (event) => {
 
 async function answer(tree, kind, fields = {}, goesOn = true) {
   const { number } = tree, seen = annotationOf(tree), run = state.annotations?.run;
-  const { dbh_cm = null } = { ...seen, ...fields }, given = { ...answerOf(tree, kind, dbh_cm), before: seen, isAsked: "dbh_cm" in fields };
+  const { dbh_cm = null } = { ...seen, ...fields }, given = { number, kind, dbh: dbh_cm, before: seen };
   Object.assign(draft, { kind: null, refused: "" });
   if (seen && Object.entries({ kind, ...fields }).every(([name, value]) => seen[name] === value)) {
     draft.answer = { ...given, isStored: true };
@@ -455,7 +460,17 @@ export async function skip() {
 // The order needs the votes: a key pressed before they have arrived waits for them.
 async function next() {
   if (!votes.known) await updateVotes.now();
-  lookAt(following()[0]);
+  const [tree] = following();
+  lookAt(tree);
+  offered = tree && !isSelectedByOther(tree) ? tree.number : null;
+}
+
+// Two people may come to one tree within the time of a message: it is left to whose selection came first.
+let offered = null; // number of the tree to which the review came, until the server tells whose selection was the first
+function giveWay() {
+  if (state.isOtherFirst === null || state.selected !== offered) return;
+  offered = null;
+  if (state.isOtherFirst) next();
 }
 
 // Shows a tree in the review; none stays where the review is.
@@ -489,7 +504,7 @@ export function previous() {
 
 // The last trees of the map that were answered in this window, the newest last; those whose answer was undone are open again. The ids
 // of their annotations are kept until the window is closed: a rerun changes the numbers of trees, and `who` of an annotation changes
-// when the person gives a name and is also that of imported ones.
+// when the person gives a name and may also be that of imported ones.
 export function answeredTrees() {
   const stored = draft.answered.map((id) => treeNumberOf({ id })).filter((number) => !answering.has(number));
   return [...new Set([...stored, ...answering])].map(treeOf).filter(Boolean);
@@ -514,16 +529,13 @@ function keepAnswered(id) {
   remember(`answered.${state.annotations.run}`, JSON.stringify(draft.answered), "sessionStorage");
 }
 
-// What an edit states about a tree, and the diameter that the map had then.
-const answerOf = ({ number, dbh_cm: mapped, sigma_dbh_cm: sigma }, kind, dbh) => ({ number, kind, dbh, mapped, sigma });
-
 const statement = (kind, dbh) => (dbh === null ? kind : `${kind}, ${dbh} cm`);
 
 // What the last edit said about a tree ("Tree 40: tree, 31.5 cm"); "" if it said nothing about one.
 export function answerText() {
   if (!draft.answer) return "";
   const { number, kind, dbh, isStored } = draft.answer;
-  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${replacedText(draft.answer)}${draft.answer.isAsked ? "" : dbhDoubt(draft.answer)}`;
+  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${replacedText(draft.answer)}`;
 }
 
 // The answer that this one replaced, with the name of another person.
@@ -534,14 +546,12 @@ function replacedText({ before, kind, dbh, isStored }) {
 
 export const byOther = (row) => (row.who === myName() ? "" : ` by ${row.who}`);
 
-// Why a DBH that is typed for a found tree [cm] is doubtful; "" if it is not.
-export const typedDoubt = (tree, dbh) => dbhDoubt(answerOf(tree, "tree", dbh)).replace("; the", "The");
-
-// A typed diameter that differs from that of the map by more than chance is often one in another unit.
-function dbhDoubt({ dbh, mapped, sigma }) {
+// Why a DBH that is typed for a found tree [cm] is doubtful; "" if it is not. One that differs from that of the map by more than
+// chance is often in another unit.
+export function typedDoubt({ dbh_cm: mapped, sigma_dbh_cm: sigma }, dbh) {
   if ([dbh, mapped, sigma].includes(null)) return "";
   const isNear = Math.abs(dbh - mapped) <= MOST_SIGMAS * Math.hypot(sigma, state.annotations?.tape_sigma_cm ?? 0);
-  return isNear ? "" : `; the map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
+  return isNear ? "" : `The map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
 }
 
 // --- the chosen annotation -------------------------------------------------------------------------------------
@@ -637,6 +647,7 @@ export function startAnnotating() {
   on("annotations map selection", keepOneSelection);
   on("selection", forgetTreeBefore);
   on("others", noteOthers);
+  on("others", giveWay);
   on("annotations", () => leftByOthers.clear());
   on("tab", () => {
     state.keepsSelection = annotating() || visible("repair");

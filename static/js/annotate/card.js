@@ -10,7 +10,7 @@ import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { openTab } from "../shell/tabs.js";
-import { annotating, annotationOf, askForTree, byOther, draft, following, measureDbh, news, reviewOf, showCard, typedDbh, typedDoubt } from "./annotations.js";
+import { annotating, annotationOf, askForTree, byOther, draft, following, isSkippable, measureDbh, news, readyIn, reviewOf, showCard, typedDbh, typedDoubt } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
@@ -190,6 +190,16 @@ function requestPicture(number) {
   image.src = `/api/camera/tree/${number}.jpg`;
 }
 
+// The answers are drawn as disabled while they do not count; a press tells why.
+let readying = 0;
+function showReady() {
+  const tree = selectedTree(), wait = tree ? readyIn(tree) : 0;
+  for (const id of ["yes", "no"]) byId(`annotate-${id}`).setAttribute("aria-disabled", String(wait > 0));
+  byId("annotate-next").setAttribute("aria-disabled", String(wait > 0 && isSkippable(tree)));
+  clearTimeout(readying);
+  if (wait > 0 && wait < Infinity) readying = setTimeout(showReady, wait);
+}
+
 // Evidence of another tree stays visible but dimmed until that of the selected one arrives.
 export function fillCard() {
   const tree = selectedTree();
@@ -201,22 +211,23 @@ export function fillCard() {
     shown = "";
     pictured = draft.shown = null;
     delete evidence().dataset.tree; // a tree of another run may have its number
-    return;
+    return showReady();
   }
   const old = evidence().dataset.tree !== String(tree.number), review = reviewOf(tree);
   const before = draft.shown;
   draft.shown = old ? null : tree.number;
   if (draft.shown !== before) {
     draft.shownAt = Infinity; // until it is drawn
-    requestAnimationFrame(() => { draft.shownAt = performance.now(); });
+    requestAnimationFrame(() => { draft.shownAt = performance.now(); showReady(); });
   }
   setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
   setText(byId("review-state"), `${review === "rejected" ? `rejected: ${annotationOf(tree).kind}` : review}${["open", "skipped"].includes(review) ? "" : byOther(annotationOf(tree))}`);
-  byId("review-state").dataset.state = review;
+  Object.assign(byId("review-state"), { title: byId("review-state").textContent }).dataset.state = review;
   for (const id of ["review", "review-more"]) byId(id).classList.toggle("loading", old);
   byId("review").setAttribute("aria-busy", String(old));
   fillDbh(tree);
   requestPicture(tree.number);
+  showReady();
 }
 
 export function startCard() {

@@ -71,8 +71,8 @@ function build() {
         ...[["tree"], ["class"], ["DBH cm"], ["x ", unitNode()], ["y ", unitNode()], ["by"]].map((parts) => el("th", { scope: "col" }, ...parts)), el("td"))), el("tbody"))),
     el("div", { class: "annotate-files" },
       el("label", {}, "Name ", nameField("annotate-name")),
-      button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised. The rows are stored under your name", () => file.click()), unit,
-      el("label", { title: "For a table that was saved here and corrected elsewhere: its class and DBH replace those of the annotation at the same place; an empty DBH keeps the one here. Otherwise rows that differ are left out and named" }, replaces, " replace what differs"), file,
+      button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised. A row is listed under the name in a column who, as in saved tables, else as an import of the file", () => file.click()), unit,
+      el("label", { title: "For a table that was saved here and corrected elsewhere: its class and DBH replace those of the annotation at the same place; an emptied DBH removes the one here. Otherwise rows that differ are left out and named" }, replaces, " replace what differs"), file,
       truthLink("csv", "CSV"), truthLink("geojson", "GeoJSON")),
     ...ofExtensions("annotateSections"));
 }
@@ -106,7 +106,7 @@ async function take(file, unit, replaces) {
     return fill();
   }
   const confirmed = () => trees().filter((tree) => reviewOf(tree) === "confirmed").length, before = confirmed();
-  const done = await importTable(await file.text(), unit, replaces);
+  const done = await importTable(await file.text(), file.name, unit, replaces);
   const more = confirmed() - before;
   if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
   if (done) showDone(imported);
@@ -227,16 +227,17 @@ function fillHistory() {
     ...shown.map((tree) => el("button", { class: "quiet small", type: "button", "aria-pressed": String(tree.number === state.selected), text: `${tree.number} ${classOf(tree)}`, title: `Show tree ${tree.number} again`, onclick: () => lookAt(tree) })));
 }
 
-// Buttons that choose annotations, the first ones of many.
+// Buttons that choose annotations, the first ones of many, and how many more there are.
 function fillRows(box, annotations) {
-  const shown = annotations.slice(0, MOST_LISTED), now = JSON.stringify([shown.map((row) => [row.id, row.kind, treeNumberOf(row)]), draft.chosen]);
+  const shown = annotations.slice(0, MOST_LISTED), more = annotations.length - shown.length;
+  const now = JSON.stringify([more, shown.map((row) => [row.id, row.kind, treeNumberOf(row)]), draft.chosen]);
   box.hidden = !shown.length;
   if (box.dataset.now === now) return; // the focus stays on a button
   box.dataset.now = now;
   box.replaceChildren(...shown.map((row) => {
     const number = treeNumberOf(row), place = placeTexts([row.x, row.y]).join(", ");
     return el("button", { class: "quiet small", type: "button", "aria-pressed": String(row.id === draft.chosen), text: `${number === null ? `at ${place}` : number} ${row.kind}`, title: `Select it: ${row.kind} by ${row.who} at ${place}`, onclick: () => { choose(row.id); showCard(); } });
-  }));
+  }), more ? el("span", { text: `and ${more} more` }) : "");
 }
 
 const classOf = (tree) => annotationOf(tree)?.kind ?? "…"; // its answer is on its way

@@ -45,7 +45,10 @@ function receiveMap({ path, ...map }) {
 
 // An answer to an earlier click must not undo a later one. Of another run than before, numbers of trees mean nothing any more.
 function receiveSelection({ tree, cluster, place, by, pages, run: now }) {
-  state.selectedByOthers = Object.entries(pages).filter(([each]) => each !== page).map(([, number]) => number);
+  const known = Object.entries(pages), own = known.findIndex(([each, number]) => each === page && number === state.selected);
+  state.selectedByOthers = known.filter(([each]) => each !== page).map(([, number]) => number);
+  const isTaken = (own < 0 ? known : known.slice(0, own)).some(([, number]) => number === state.selected);
+  state.isOtherFirst = isTaken || own >= 0 ? isTaken : null;
   const isKept = state.keepsSelection && ![null, page].includes(by) && now === run;
   run = now;
   changed("others");

@@ -14,6 +14,7 @@ export const state = {
   selected: null,    // number of the selected tree
   selectedElsewhere: false, // whether the server chose it: for another page, or by a click in the scene
   selectedByOthers: [], // numbers of the trees that other pages have selected
+  isOtherFirst: null, // whether another page selected the same tree before this one; null until the server tells
   keepsSelection: false, // whether the selections of other pages leave that of this page as it is: while it shows the tab Annotate or Repair, which edit the selected tree
   place: null,       // [x, y, z] of the selection on the ground, once the server has answered
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when selected

@@ -36,7 +36,7 @@ from app.web.auth import session_value
 from app.web.routes.annotations import _imported, _ImportTable
 from app.worker.protocol import Shown
 from pipeline.geometry.columns import rows_of
-from pipeline.io.ground_truth import parse_truth_trees
+from pipeline.io.ground_truth import read_truth_trees
 from pipeline.repairs.record import Repair
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import frame, opened, path, truth_trees
@@ -206,7 +206,7 @@ async def test_what_is_not_there_is_said(both: Running) -> None:
     assert len(await rows(client)) == 1
 
 
-async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
+async def test_a_table_goes_in_and_comes_out(both: Running, tmp_path: Path) -> None:
     client, _ = both
     table = "Easting,Northing,DBH,class\n1.5,2.5,0.31,tree\n3.0,4.0,,pole\n"
     unsaid = await edit(client, "POST", "/import", table=table)
@@ -222,7 +222,8 @@ async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
     await edit(client, "POST", "/undo")
     out = await client.get("/api/annotations.csv")
     assert 'filename="truth.csv"' in out.headers["content-disposition"]
-    read = contents_of(parse_truth_trees(out.text, where="here"))
+    (tmp_path / "truth.csv").write_text(out.text)
+    read = contents_of(read_truth_trees(tmp_path / "truth.csv"))
     assert read == [Content(1.5, 2.5, "tree", 0.31), Content(3.0, 4.0, "pole", None)]
     assert out.text.splitlines()[0] == "x_m,y_m,dbh_cm,class,who,edited,tree"
     told = json.loads((await client.get("/api/annotations.geojson")).text)
@@ -322,7 +323,7 @@ def test_a_table_for_a_cloud_in_feet_may_be_in_feet_or_metres(metres: float) -> 
     foot = 0.3048
     x, y = 2_491_010.0 * foot / metres, 6_973_020.0 * foot / metres
     body = _ImportTable.model_validate({"run": 1, **ANN, "table": f"x,y,dbh_cm\n{x},{y},31\n"})
-    [content] = _imported(body, (2_491_000.0 * foot, 6_973_000.0 * foot), (foot, foot))
+    [content], _ = _imported(body, (2_491_000.0 * foot, 6_973_000.0 * foot), (foot, foot))
     assert (content.x, content.y) == pytest.approx((10.0 * foot, 20.0 * foot), abs=1e-6)
     assert content.dbh == pytest.approx(0.31)
 
@@ -335,7 +336,7 @@ def test_a_table_for_a_cloud_in_feet_may_be_in_feet_or_metres(metres: float) -> 
         ("x_m,y_m\n1,up\n", "line 2"),
         ("x_m,y_m\n1,nan\n", "line 2"),
         ("x_m,y_m\n1e9,0\n", "line 2"),
-        ("x_m,y_m\n2e7,0\n", "row 1"),
+        ("x_m,y_m\n2e7,0\n", "line 2"),
         ("x_m,y_m,dbh_m\n1,0,31\n", "median diameter"),
         ("x_m,y_m,class\n1,0,shrub\n", "shrub"),
         ("x_m,y_m\n" + "".join(f"{k},0\n" for k in range(5001)), "5000"),
@@ -347,6 +348,49 @@ async def test_a_table_that_cannot_be_used_adds_nothing(both: Running, table: st
     assert answer.status_code == 422
     assert word in answer.json()["error"]["what"]
     assert await rows(client) == []
+
+
+async def test_all_faults_of_a_table_are_named(both: Running) -> None:
+    client, _ = both
+    faulty = "x_m,y_m,dbh_cm,class,who\nup,0,30,shrub,Ann\n\n2e7,0,2000,,=cmd()\n1,2,30,,\n"
+    refused = (await edit(client, "POST", "/import", table=faulty)).json()["error"]
+    assert refused["what"] == (
+        "line 2: x_m = 'up' is not a number; line 2: class 'shrub' is not one of tree, pole, person, bush, "
+        "other, hidden; line 4: it is farther than 10,000,000 m from the origin; line 4: the DBH is 20.0 m; "
+        "line 4: who = '=cmd()' is not a name"
+    )
+    assert refused["remedy"] == "Check the unit of the diameter"
+    many = "x_m,y_m\n" + "2e7,0\n" * 13
+    refused = (await edit(client, "POST", "/import", table=many)).json()["error"]
+    assert refused["what"].count("line ") == 10
+    assert refused["what"].endswith("; and 3 more")
+
+
+async def test_an_imported_row_has_the_author_of_its_table_else_the_name_of_the_file(both: Running) -> None:
+    client, _ = both
+
+    async def authors() -> list[str]:
+        return [row["who"] for row in await rows(client)]
+
+    await edit(client, "POST", x=1.0, y=2.0)
+    await edit(client, "POST", x=3.0, y=2.0)
+    table = "x_m,y_m,dbh_cm,class,who\n1,2,26.4,tree,Ann\n3,2,30,tree,Eve\n7,8,31,tree,Eve\n9,8,31,tree,\n"
+    await edit(client, "POST", "/import", table=table, file="plot (2).csv")
+    imported = "import of plot _2_.csv"
+    # Ann has not measured her tree here: her annotation was changed by the import.
+    assert await authors() == [imported, "Eve", "Eve", imported]
+    number = (await rows(client))[2]["id"]
+    await edit(client, "PATCH", f"/{number}", version=1, x=7.0, y=8.0, kind="pole")
+    assert await authors() == [imported, "Eve", "Ann", imported]
+    for where, expected in (("undo", "Eve"), ("undo", None), ("redo", "Eve"), ("redo", "Ann")):
+        await edit(client, "POST", f"/{where}")
+        known = await authors()
+        assert known[2:3] == ([] if expected is None else [expected])
+        assert known[:2] == (["Ann", "Ann"] if expected is None else [imported, "Eve"])
+    out = (await client.get("/api/annotations.csv")).text.splitlines()
+    assert [line.split(",")[4] for line in out[1:]] == [imported, "Eve", "Ann", imported]
+    await edit(client, "POST", "/import", table="x_m,y_m\n50,50\n", file="")
+    assert (await authors())[-1] == "import"
 
 
 async def test_a_body_that_is_too_large_is_refused(both: Running) -> None:
@@ -566,6 +610,19 @@ def test_a_table_changes_only_what_its_rows_are_about(replaces: bool) -> None:
     plan = import_plan([open_], twice, replaces=replaces)
     assert [content and content.dbh for *_, content in plan.filled] == [0.3]
     assert (plan.replaced, len(plan.conflicts)) == ([], 1)
+
+
+@pytest.mark.parametrize(("replaces", "has_diameters", "left"), [
+    (True, True, [None]), (True, False, []), (False, True, []),
+])  # fmt: skip
+def test_an_emptied_diameter_is_a_difference(
+    replaces: bool, has_diameters: bool, left: list[float | None]
+) -> None:
+    measured = Annotation(1, Content(0.0, 0.0, "tree", 0.31), "Ann", 0, 1)
+    emptied = [Content(0.0, 0.0, "tree", None)]
+    plan = import_plan([measured], emptied, replaces=replaces, has_diameters=has_diameters)
+    assert [content and content.dbh for *_, content in plan.replaced] == left
+    assert (plan.filled, plan.conflicts, plan.repeated) == ([], [], 1 - len(left))
 
 
 async def test_the_reach_is_that_of_the_map_in_which_an_answer_was_given(both: Running) -> None:

@@ -81,6 +81,12 @@ async def test_a_selection_names_its_page_and_what_the_open_pages_have_selected(
             await other.send('{"type":"select","tree":2}')
             told = await selection(one, tree=2)
             assert (told["by"], told["pages"], told["run"]) == (bob, {ann: 1, bob: 2}, 1)
+            await one.send('{"type":"select","tree":2}')  # the order tells who came to it first
+            assert list((await selection(one, by=ann, tree=2))["pages"]) == [bob, ann]
+            await one.send('{"type":"select","tree":1}')
+            await selection(one, by=ann, tree=1)
+            await other.send('{"type":"select","tree":2}')
+            assert list((await selection(one, by=bob))["pages"]) == [bob, ann]
         assert (await selection(one, tree=2, pages={ann: 1}))["by"] == bob  # the other page was closed
         dashboard.selector.remove([2])
         assert (await selection(one, tree=None, pages={ann: 1}))["by"] == bob

@@ -125,6 +125,24 @@ def test_a_cloud_is_opened_and_its_stems_have_sections_and_heights(page: Dashboa
     expect(story.get_by_text("Stem curve")).to_be_visible()
 
 
+def test_the_card_of_a_tree_shows_all_cross_sections(page: Dashboard) -> None:
+    before = page.page.viewport_size
+    page.page.set_viewport_size({"width": 1440, "height": 900})
+    page.tab("Trees")
+    page.page.locator("#trees tbody tr").nth(1).click()
+    page.tab("Annotate")
+    page.card_shown()
+    evidence = page.page.locator("#review-evidence")
+    expect(evidence.get_by_text("9 cross-sections")).to_be_in_viewport(ratio=1)
+    sections = evidence.locator(".section")
+    expect(sections).to_have_count(9)
+    for k in range(9):
+        expect(sections.nth(k)).to_be_in_viewport(ratio=0.95)
+    assert before is not None
+    page.page.set_viewport_size(before)
+    page.tab("Story")
+
+
 def test_a_candidate_that_is_no_tree_shows_why(page: Dashboard) -> None:
     page.page.locator("#map").click(position=place_of(page, *BUSH))
     story = page.page.locator("#panel-story")

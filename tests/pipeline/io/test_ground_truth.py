@@ -144,6 +144,14 @@ def test_what_does_not_fit_is_said_with_line_and_column(tmp_path, text, says):
     assert "\n" not in str(caught.value)
 
 
+def test_all_faults_are_named_in_the_order_of_the_lines(tmp_path):
+    with pytest.raises(SourceError) as caught:
+        read(tmp_path, "x_m,y_m,class\n1,2,cow\nup,2,tree\n" + "1,,\n" * 11)
+    assert caught.value.what.startswith("line 2: class 'cow' is not one of tree, pole")
+    assert "; line 3: x_m = 'up' is not a number; line 4: y_m = '' is" in caught.value.what
+    assert caught.value.what.endswith("line 11: y_m = '' is not a number; and 3 more")
+
+
 def test_a_table_that_would_take_gigabytes_is_refused(tmp_path):
     with pytest.raises(SourceError, match="larger than 8 MB"):
         read(tmp_path, "x_m,y_m\n" + "1,1\n" * (3 << 20))

@@ -42,7 +42,7 @@ function candidateFigures({ around }, known) {
 }
 
 export function treeEvidence({ extensions }) {
-  return extensions.clouds ? [sectionsFigure(extensions.clouds.sections, byBreast)] : [];
+  return extensions.clouds ? [sectionsFigure(extensions.clouds.sections, byBreast, (number) => count(number, "cross-section"))] : [];
 }
 
 function why(story, circles) {
@@ -68,12 +68,12 @@ function figures(story, stem) {
 const byHeight = (a, b) => b.height - a.height;
 const byBreast = (a, b) => Math.abs(a.height - BREAST) - Math.abs(b.height - BREAST);
 
-// Pictures of the sections with points, highest first unless another order is given, all at one scale.
-function sectionsFigure(sections, order = byHeight) {
+// Pictures of the sections with points, highest first unless another order is given, all at one scale; `caption` gets their number.
+function sectionsFigure(sections, order = byHeight, caption = () => "Cross-sections with the fitted circles; x of the map to the right") {
   const shown = sections.filter(({ points }) => points.length).sort(order);
   if (!shown.length) return "";
   const reach = Math.max(0.05, ...shown.map(({ radius, points }) => Math.max(radius ?? 0, ...points.map(([x, y]) => Math.hypot(x, y)))));
-  return el("figure", { "data-sections": String(shown.length) }, el("figcaption", { text: "Cross-sections with the fitted circles; x of the map to the right" }),
+  return el("figure", { "data-sections": String(shown.length) }, el("figcaption", { text: caption(shown.length) }),
     el("div", { class: "sections" }, ...shown.map((section) => sectionPicture(section, reach))));
 }
 
