@@ -17,6 +17,17 @@ _PCAP = (
 )  # fmt: skip
 
 
+#: Messages with packets that are not decoded.
+_HESAI = ("hesai_ros_driver/msg/UdpFrame", "hesai_ros_driver/msg/UdpPacket")
+_ROBOSENSE = (
+    "rslidar_msgs/msg/RslidarPacket",
+    "rslidar_msgs/msg/RslidarScan",
+    "rslidar_msg/msg/RslidarPacket",
+    "rslidar_msg/msg/RslidarScan",
+    "rscamera_msg/msg/RslidarPacket",
+)
+
+
 def _later(module: str, name: str) -> Callable[..., Any]:
     """Return a function that imports a module of this extension and calls its member when it is called."""
     return lambda *given: getattr(import_module(f"{__name__}.{module}"), name)(*given)
@@ -31,7 +42,7 @@ def _is_tree_manager(names: Collection[str]) -> bool:
 def _formats() -> tuple[Format | PacketFormat, ...]:
     """Return the formats."""
     from pipeline.io.readers import Format, PacketFormat, format_of_points
-    from pipeline.io.readers.sensor_families import HESAI_SCANS, OUSTER_PACKETS
+    from pipeline.io.readers.sensor_families import CUSTOM_TYPES, HESAI_SCANS, OUSTER_PACKETS
 
     stems = "a folder of TreeManagerState_<i>.csv with trajectory.txt"
     return (
@@ -56,10 +67,16 @@ def _formats() -> tuple[Format | PacketFormat, ...]:
             accepts=_later("text_points", "is_text_of_points"),
         ),
         Format(stems, (), (), _later("tree_manager", "TreeManagerSource"), is_folder=_is_tree_manager),
+        PacketFormat("messages of Livox", CUSTOM_TYPES, columns=_later("livox", "columns_of")),
         PacketFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "HesaiDecoder")),
         PacketFormat(
-            "raw packets of Ouster", OUSTER_PACKETS, recording=_later("ouster", "with_packets_decoded")
+            "raw packets of Ouster",
+            OUSTER_PACKETS,
+            recording=_later("ouster", "with_packets_decoded"),
+            driver="ouster_ros",
         ),
+        PacketFormat("raw packets of Hesai", _HESAI, driver="hesai_ros_driver"),
+        PacketFormat("raw packets of RoboSense", _ROBOSENSE, driver="rslidar_sdk"),
     )
 
 

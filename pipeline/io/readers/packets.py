@@ -1,4 +1,4 @@
-"""How packets of LiDARs in ROS messages are read, beside those of Velodyne; `add_formats` adds them."""
+"""How messages of makers of LiDARs are read, beside those of Velodyne; `add_formats` adds them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pipeline.io.readers.base import SourceOptions
     from pipeline.io.readers.container import Container
     from pipeline.types.records import Scan, Sensor
@@ -40,7 +43,7 @@ class SweepDecoder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PacketFormat:
-    """Packets of a maker in ROS messages.
+    """Packets or scans of a maker in ROS messages.
 
     Attributes:
         words: Name for the user.
@@ -48,7 +51,11 @@ class PacketFormat:
         sweeps: Returns a decoder of messages with the packets of one sweep; None if a message has one packet.
         recording: Function of a recording, its file or folder, the choices of the user and the recording as
             the user wrote it. It returns the recording with clouds in place of packets, or as it is if it has
-            none that shall be decoded; None if `sweeps` decodes them.
+            none that shall be decoded; None if it does not decode them.
+        columns: Function of a message with all points of a scan, its encoding and its stamp [ns]. It returns
+            the frame and a dict from names to columns, see `scan_of`; it raises any exception for a damaged
+            one. None for packets.
+        driver: Driver that makes clouds of packets which are not decoded, or not of live robots.
         refusal: Why it cannot be used, as the remedy of an error; "" if it can.
     """
 
@@ -56,4 +63,6 @@ class PacketFormat:
     msgtypes: tuple[str, ...]
     sweeps: Callable[[], SweepDecoder] | None = None
     recording: Callable[[Container, Path, SourceOptions, str], Container] | None = None
+    columns: Callable[[bytes, str, int], tuple[str, dict[str, NDArray[np.generic]]]] | None = None
+    driver: str = ""
     refusal: str = ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +13,9 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import packet_formats
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.livox import CUSTOM_TYPES, CustomMsg, decode_custom
 from pipeline.io.readers.measured_poses import Fix, GnssFrame, NoPoseError, OtherFrame, OtherPose
 from pipeline.io.readers.message_time import header_stamp
-from pipeline.io.readers.packets import PacketFormat, SweepDecoder
+from pipeline.io.readers.packets import SweepDecoder
 from pipeline.io.readers.point_times import (
     LONGEST_NS,
     PointTimes,
@@ -34,6 +33,7 @@ from pipeline.io.readers.scan_columns import (
     scan_of,
     timed_scan,
 )
+from pipeline.io.readers.sensor_families import CUSTOM_TYPES
 from pipeline.io.readers.topics import (
     IMU,
     LASER_SCAN,
@@ -161,17 +161,6 @@ def decode_laser_scan(laser: ros2.sensor_msgs__msg__LaserScan, stamp_ns: int) ->
     )
 
 
-def _columns_of_custom(custom: CustomMsg, header_ns: int) -> dict[str, NDArray[np.generic]]:
-    """Return a dict from names to columns of a Livox CustomMsg, shape (N,). The times of the points are after
-    its stamp: by its time base if this is by the clock of the stamp (within 2 s), else the time base is taken
-    as the stamp, `header_ns` [ns]."""
-    columns = {name: custom.points[name] for name in custom.points.dtype.names or ()}
-    late_ns = custom.timebase_ns - header_ns
-    if abs(late_ns) < 2 * LONGEST_NS:
-        columns["offset_time"] = columns["offset_time"].astype(np.int64) + late_ns
-    return columns
-
-
 _NAMES = {ODOMETRY: "odometry messages", IMU: "IMU messages", NAV_SAT_FIX: "GNSS messages"}
 
 
@@ -198,6 +187,7 @@ class RecordDecoder:
         """Create a decoder without a base frame and frames of measured poses."""
         self._channels, self._tree = channels, tree
         self._decoders: dict[str, SweepDecoder] = {VELODYNE_SCAN: VelodyneDecoder()}
+        self._columns: dict[str, Callable[..., tuple[str, dict[str, NDArray[np.generic]]]]] = {}
         self.base = ""
         self.frames: dict[str, GnssFrame | OtherFrame] = {}
         self._poses = poses
@@ -279,12 +269,17 @@ class RecordDecoder:
     def _decoder_of(self, msgtype: str) -> SweepDecoder:
         """Return the decoder of messages of packets; SourceError if there is none for this type."""
         if msgtype not in self._decoders:
-            found = (kind for kind in packet_formats() if msgtype in kind.msgtypes)
-            kind = next(found, PacketFormat(f"packets of the type {msgtype}", (msgtype,)))
-            if kind.refusal or kind.sweeps is None:
-                raise SourceError(f"{kind.words} need an extension", remedy=kind.refusal)
-            self._decoders[msgtype] = kind.sweeps()
+            self._decoders[msgtype] = self._of_format(msgtype, "sweeps")()
         return self._decoders[msgtype]
+
+    def _of_format(self, msgtype: str, part: str) -> Any:  # noqa: ANN401
+        """Return a part of the format of messages of a maker, see `PacketFormat`; SourceError if no format
+        that can be used has it."""
+        kind = next((kind for kind in packet_formats() if msgtype in kind.msgtypes), None)
+        if kind is None or kind.refusal or getattr(kind, part) is None:
+            remedy = "" if kind is None else kind.refusal
+            raise SourceError(f"messages of the type {msgtype} need an extension", remedy=remedy)
+        return getattr(kind, part)
 
     def timed(self, message: Message) -> tuple[str, TimedScan] | None:
         """Return the frame of a cloud and what its times are decided by; None for another type, or a cloud
@@ -310,8 +305,11 @@ class RecordDecoder:
         if channel.msgtype == POINT_CLOUD:
             cloud: ros2.sensor_msgs__msg__PointCloud2 = self.message(message)
             return frame_name(cloud.header.frame_id), cloud_columns(cloud)
-        custom = decode_custom(message.payload, channel.encoding)
-        return frame_name(custom.frame), _columns_of_custom(custom, self._header_ns(message))
+        if channel.msgtype not in self._columns:
+            self._columns[channel.msgtype] = self._of_format(channel.msgtype, "columns")
+        decoder = self._columns[channel.msgtype]
+        frame, columns = decoder(message.payload, channel.encoding, self._header_ns(message))
+        return frame_name(frame), columns
 
     def _timed_scan(
         self,
