@@ -207,8 +207,8 @@ class Format:
         open: Function of URI, path and options that opens the source.
         table: Opens the table of a file of points (`PointTable`): a whole cloud or one scan. None for others.
         scans: Name of such files if they may also be the scans of a drive in a folder, e.g. "PCD"; else "".
-        accepts: Whether a file with these first bytes is of this format, for a format without magic bytes
-            whose suffixes others have, too; None for other formats.
+        accepts: Whether a file with these first bytes (up to _HEAD) is of this format, for a format without
+            magic bytes whose suffixes others have, too; None for other formats.
         scheme: Beginning of the addresses that it opens, such as "sim:cloud"; "" for none. Options `file` and
             `truth` of such an address are files, which the dashboard lets only permitted people name.
         check: Raises UsageError for an address with other options; None for no check.
@@ -303,7 +303,7 @@ def packet_formats() -> tuple[PacketFormat, ...]:
 def readable() -> str:
     """Return what can be opened, as the remedy of an error."""
     usable = [kind for kind in formats() if not kind.refusal]
-    scans = ", ".join(suffix for kind in usable if kind.scans for suffix in kind.suffixes)
+    scans = ", ".join(dict.fromkeys(suffix for kind in usable if kind.scans for suffix in kind.suffixes))
     folders = (
         f"a folder of scans ({scans})",
         "a rosbag2 folder",
@@ -314,8 +314,8 @@ def readable() -> str:
 
 def file_format(path: Path, head: bytes) -> Format | None:
     """Return the format of a file, None if it is unknown. The first bytes decide; the suffix decides for .npz
-    and for formats without magic bytes. A file with an unknown suffix or none has the format that accepts its
-    first bytes.
+    and for formats without magic bytes; of several with this suffix, or for an unknown suffix or none, the
+    one that accepts the first bytes.
 
     Args:
         path: The file; it is not opened.
@@ -326,10 +326,11 @@ def file_format(path: Path, head: bytes) -> Format | None:
     for kind in formats():
         if any(head.startswith(mark) for mark in kind.magic):
             return kind
-    expected = expected_format(path)
-    if expected is not None:
-        return None if expected.magic else expected
-    return next((kind for kind in formats() if kind.accepts is not None and kind.accepts(head)), None)
+    expected, suffix = expected_format(path), path.suffix.lower()
+    if expected is not None and expected.magic:
+        return None
+    kinds = (kind for kind in formats() if expected is None or suffix in kind.suffixes)
+    return next((kind for kind in kinds if kind.accepts is not None and kind.accepts(head)), expected)
 
 
 _HEAD = 64 << 10  # bytes by which a format is found

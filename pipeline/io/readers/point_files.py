@@ -21,7 +21,7 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import expected_format, file_format, head_of, readable
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss
 from pipeline.io.readers.pose_files import read_rows
-from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT
+from pipeline.io.readers.scan_columns import POINT_LIMIT
 from pipeline.jit import compiled
 from pipeline.types.records import Float
 
@@ -151,74 +151,24 @@ def open_table(path: Path) -> PointTable:
     return kind.table(path)
 
 
-# --- rows without a header ---------------------------------------------------------------------------
-
-#: Rows of .bin files, of float32 each: KITTI, nuScenes, Boreas. Those of NCLT are whole numbers.
-_ROWS = (
-    ("KITTI .bin", ("x", "y", "z", "intensity")),
-    ("nuScenes .bin", ("x", "y", "z", "intensity", "ring")),
-    ("Boreas .bin", ("x", "y", "z", "intensity", "ring", "time")),
-)
-_NCLT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
-#: Unit and offset of the coordinates of NCLT [m], whose y points to the right and z down.
-_NCLT_UNIT, _NCLT_ZERO = 0.005, -100.0
-#: Height from the sensor that few returns of a drive exceed [m]: the LiDARs of these data sets (HDL-64E,
-#: HDL-32E, VLS-128) look up by 15 degrees at most, which is 50 m at a distance of 190 m.
-_HIGHEST = 50.0
-_TESTED_ROWS = 48_000  # bytes, whole rows of each kind
-#: Smaller files are KITTI: less than 20 rows may fit to another layout by chance.
-_LEAST = 320  # bytes
-_FITTING = 0.99  # share of rows that are sound by the right layout; the rest is damage
+_ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 
 
 def open_rows(path: Path) -> PointTable:
-    """Return the table of a .bin file, whose rows have no header: those of KITTI (x, y, z and reflectance as
-    float32), unless only those of nuScenes, Boreas or NCLT give positions and reflectances.
+    """Return the table of a .bin file of KITTI: rows of x, y, z and reflectance as float32, without a header.
 
     Raises:
         ScanFileError: It is too large, or shorter than a point.
         OSError: The file cannot be read.
     """
+    return rows_table(path, "KITTI .bin", _ROW)
+
+
+def rows_table(path: Path, kind: str, dtype: np.dtype[Any]) -> PointTable:
+    """Return the table of rows without a header, see `open_rows`. An incomplete last row is a promised point,
+    which its reader counts as missing."""
     size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(_TESTED_ROWS)
-    layouts = [(kind, np.dtype([(name, "<f4") for name in names])) for kind, names in _ROWS]
-    kitti, dtype = layouts[0]
-    for kind, other in layouts if size >= _LEAST else ():
-        if _are_rows(_first_rows(head, other)):
-            return _rows_table(path, kind, other, size)
-    if size >= _LEAST and _are_rows(_metres(_first_rows(head, _NCLT))):
-        table = _rows_table(path, "NCLT .bin", _NCLT, size)
-        return replace(table, read=lambda begin: (_metres(part) for part in table.read(begin)))
-    return _rows_table(path, kitti, dtype, size)
-
-
-def _rows_table(path: Path, kind: str, dtype: np.dtype[Any], size: int) -> PointTable:
-    """Return the table of rows without a header in a file of some bytes. An incomplete last row is a promised
-    point, which its reader counts as missing."""
     return binary_table(path, kind, -(-size // dtype.itemsize), [Stream(0, dtype, size)])
-
-
-def _first_rows(head: bytes, dtype: np.dtype[Any]) -> Columns:
-    """Return the columns of the whole rows at the beginning of a file."""
-    rows = np.frombuffer(head, dtype, len(head) // dtype.itemsize)
-    return {name: rows[name] for name in dtype.names or ()}
-
-
-def _metres(columns: Columns) -> Columns:
-    """Return columns of NCLT with coordinates in metres, y to the left and z up."""
-    x, y, z = (columns[axis].astype(np.float64) * _NCLT_UNIT + _NCLT_ZERO for axis in "xyz")
-    return {**columns, "x": x, "y": -y, "z": -z}
-
-
-def _are_rows(columns: Columns) -> bool:
-    """Return whether nearly all rows without NaN have coordinates of a scan and a reflectance, and there are
-    such rows."""
-    with np.errstate(invalid="ignore"):  # signalling NaN, in a damaged file
-        rows = np.column_stack([columns[name].astype(np.float64) for name in _ROWS[0][1]])
-    x, y, z, reflectance = rows[~np.isnan(rows).any(axis=1)].T
-    sound = (np.maximum(np.abs(x), np.abs(y)) < RANGE_LIMIT) & (np.abs(z) < _HIGHEST) & (reflectance >= 0.0)
-    return bool(sound.size and sound.mean() > _FITTING)
 
 
 def read_columns(table: PointTable, losses: dict[str, int]) -> Columns:
