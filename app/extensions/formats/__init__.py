@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Any
 from app.extension import Extension
 
 if TYPE_CHECKING:
-    from pipeline.io.readers import Format, PacketFormat
+    from pipeline.io.readers import AnyFormat
 
 _PCAP = (
     b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x0a\x0d\x0d\x0a"
 )  # fmt: skip
 
 
+#: Shortest and longest stretch for poses of another SLAM [m]; short, because odometry drifts and these poses
+#: are much better than GNSS fixes.
+POSE_STRETCH = 5.0, 20.0
 #: Messages with packets that are not decoded.
 _HESAI = ("hesai_ros_driver/msg/UdpFrame", "hesai_ros_driver/msg/UdpPacket")
 _ROBOSENSE = (
@@ -39,9 +42,9 @@ def _is_tree_manager(names: Collection[str]) -> bool:
 
 
 @cache
-def _formats() -> tuple[Format | PacketFormat, ...]:
+def _formats() -> tuple[AnyFormat, ...]:
     """Return the formats."""
-    from pipeline.io.readers import Format, PacketFormat, format_of_points
+    from pipeline.io.readers import Format, PacketFormat, ReadingFormat, format_of_points
     from pipeline.io.readers.sensor_families import CUSTOM_TYPES, HESAI_SCANS, OUSTER_PACKETS
 
     stems = "a folder of TreeManagerState_<i>.csv with trajectory.txt"
@@ -85,6 +88,19 @@ def _formats() -> tuple[Format | PacketFormat, ...]:
         ),
         PacketFormat("raw packets of Hesai", _HESAI, driver="hesai_ros_driver"),
         PacketFormat("raw packets of RoboSense", _ROBOSENSE, driver="rslidar_sdk"),
+        ReadingFormat(
+            role="pose",
+            field="other_slam",
+            messages="poses of another SLAM",
+            title="other SLAM",
+            plural="Poses of another SLAM",
+            short="poses",
+            unknown="the pose of their frame",
+            read=_later("other_slam", "read_pose"),
+            align=_later("other_slam", "align_poses"),
+            stretch=POSE_STRETCH,
+            early=True,
+        ),
     )
 
 

@@ -23,8 +23,8 @@ from pipeline.io.readers.base import (
     digest_of,
 )
 from pipeline.io.readers.container import Channel, Container, Message
+from pipeline.io.readers.message_formats import SweepDecoder
 from pipeline.io.readers.mounting import assumed_mounting
-from pipeline.io.readers.packets import SweepDecoder
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.scan_columns import sensor_of
 from pipeline.io.readers.sensor_families import OUSTER, OUSTER_PACKETS

@@ -9,16 +9,24 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
-from pipeline.io.readers.packets import PacketFormat
+from pipeline.io.readers.message_formats import PacketFormat, ReadingFormat
 
 if TYPE_CHECKING:
     from pipeline.io.readers.point_files import PointTable
 
-__all__ = ["PacketFormat", "Source", "SourceDescription", "SourceOptions", "open_source", "path_of"]
+__all__ = [
+    "PacketFormat",
+    "ReadingFormat",
+    "Source",
+    "SourceDescription",
+    "SourceOptions",
+    "open_source",
+    "path_of",
+]
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+]+):")
 _LIVE = ("udp", "tcp", "ros2")
@@ -281,10 +289,12 @@ FILES = (
 )
 
 _MOST_NAMED = 5
-_further: list[Callable[[], Iterable[Format | PacketFormat]]] = []
+AnyFormat = Format | PacketFormat | ReadingFormat
+K = TypeVar("K")
+_further: list[Callable[[], Iterable[AnyFormat]]] = []
 
 
-def add_formats(further: Callable[[], Iterable[Format | PacketFormat]]) -> None:
+def add_formats(further: Callable[[], Iterable[AnyFormat]]) -> None:
     """Add formats to those of this package, which go first. The function is called whenever a file is
     opened."""
     _further.append(further)
@@ -292,12 +302,17 @@ def add_formats(further: Callable[[], Iterable[Format | PacketFormat]]) -> None:
 
 def formats() -> tuple[Format, ...]:
     """Return all formats of files and folders in the order in which they are tried."""
-    return (*FILES, *(kind for further in _further for kind in further() if isinstance(kind, Format)))
+    return (*FILES, *added(Format))
+
+
+def added(kind: type[K]) -> tuple[K, ...]:
+    """Return the formats of a kind that were added."""
+    return tuple(each for further in _further for each in further() if isinstance(each, kind))
 
 
 def packet_formats() -> tuple[PacketFormat, ...]:
     """Return the formats of packets in ROS messages that were added."""
-    return tuple(kind for further in _further for kind in further() if isinstance(kind, PacketFormat))
+    return added(PacketFormat)
 
 
 def readable() -> str:

@@ -15,7 +15,7 @@ from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import MessageSource
 from pipeline.io.readers.container import Container, Message
-from pipeline.io.readers.measured_poses import Fix, FrameAlignments
+from pipeline.io.readers.measured_poses import Fix, FrameAlignments, read_fix, readings_of
 from pipeline.io.readers.message_time import Stamped, in_order_of_stamps
 from pipeline.io.readers.robot_body import body_words
 from pipeline.io.readers.ros_description import RosOpening, describe
@@ -154,7 +154,7 @@ class RosSource(MessageSource):
         topics = choose_topics(channels.values(), options.topics, uri, partial(nearness, tree, frames))
         odometry = choose_odometry(extrinsics, topics, frames, options.topics, live=live)
         scans = odometry.topics.chosen["scan"]
-        decoder = RecordDecoder(channels, tree, odometry.topics.numbers("pose"))
+        decoder = RecordDecoder(channels, tree, readings_of(odometry.topics))
         self._truth, sensor, spoilt = _attached_truth(container, uri)
         times = times_of_topic(container, decoder, scans)
         decoder.times.update(times.times)
@@ -244,7 +244,7 @@ class RosSource(MessageSource):
         found, messages = list[Fix](), self._reader.messages
         for stamped in messages.messages(messages.odometry.topics.numbers("gnss")):
             try:
-                fix, _ = self._reader.decoder.fix(stamped.content, stamped.stamp_ns)
+                fix, _ = read_fix(self._reader.decoder, stamped.content, stamped.stamp_ns)
             except Exception:  # noqa: S112 - as in RecordDecoder.record
                 continue
             if fix is not None:

@@ -1,19 +1,21 @@
-"""How messages of makers of LiDARs are read, beside those of Velodyne; `add_formats` adds them."""
+"""Formats of messages of LiDARs, beside those of Velodyne, and of readings of a pose in another frame."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from pipeline.geometry.poses import Float
     from pipeline.io.readers.base import SourceOptions
-    from pipeline.io.readers.container import Container
-    from pipeline.types.records import Scan, Sensor
+    from pipeline.io.readers.container import Container, Message
+    from pipeline.io.readers.ros_records import RecordDecoder
+    from pipeline.types.records import PoseMeasurement, Scan, Sensor
 
 
 class SweepDecoder(Protocol):
@@ -65,4 +67,55 @@ class PacketFormat:
     recording: Callable[[Container, Path, SourceOptions, str], Container] | None = None
     columns: Callable[[bytes, str, int], tuple[str, dict[str, NDArray[np.generic]]]] | None = None
     driver: str = ""
+    refusal: str = ""
+
+
+class UnusableReadingError(ValueError):
+    """A reading cannot be used; the message gives the reason, which is counted."""
+
+
+class MeasuredFrame(Protocol):
+    """Pose of the frame of some readings in the map frame."""
+
+    @property
+    def summary(self) -> str:
+        """How the readings are used, as text for the user."""
+
+    @property
+    def yaw_sigma(self) -> float:
+        """Standard deviation of the rotation of the frame [rad]."""
+
+    def measurement(self, reading: Any) -> PoseMeasurement | None:  # noqa: ANN401
+        """Return a reading as measurement in the map; None if it does not count."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingFormat:
+    """A kind of readings of the position or the pose in another frame.
+
+    Attributes:
+        role: Role of their topic, see `TYPES_BY_ROLE`.
+        field: Field of `SourceDescription` that describes the use of the readings.
+        messages, title, plural, short, unknown: For people: name of the messages, of the kind, plural, short
+            plural, and what a short drive does not determine.
+        read: Function of a decoder, a message and its time [ns] that returns the reading, None if the message
+            has none, and the name of its frame. It may raise any exception for a damaged message.
+        align: Function of readings, times [ns] and poses of the odometry, and distance of the sensor from the
+            base [m] that returns the frame and "", or None and the reason.
+        stretch: Distance from the start for the first fit, and for the last one [m].
+        early: Whether a recording uses the first good fit, as a live run does, or the last one.
+        refusal: Why it cannot be used, for people; "" if it can.
+    """
+
+    role: str
+    field: str
+    messages: str
+    title: str
+    plural: str
+    short: str
+    unknown: str
+    read: Callable[[RecordDecoder, Message, int], tuple[Any, str]]
+    align: Callable[[Sequence[Any], Sequence[int], Float, float], tuple[MeasuredFrame | None, str]]
+    stretch: tuple[float, float]
+    early: bool
     refusal: str = ""
