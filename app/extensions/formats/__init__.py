@@ -17,6 +17,8 @@ _PCAP = (
 )  # fmt: skip
 
 
+#: Shortest and longest stretch of the drive for GNSS fixes [m].
+FIX_STRETCH = 10.0, 100.0
 #: Shortest and longest stretch for poses of another SLAM [m]; short, because odometry drifts and these poses
 #: are much better than GNSS fixes.
 POSE_STRETCH = 5.0, 20.0
@@ -88,6 +90,19 @@ def _formats() -> tuple[AnyFormat, ...]:
         ),
         PacketFormat("raw packets of Hesai", _HESAI, driver="hesai_ros_driver"),
         PacketFormat("raw packets of RoboSense", _ROBOSENSE, driver="rslidar_sdk"),
+        ReadingFormat(
+            role="gnss",
+            field="gnss",
+            messages="GNSS messages",
+            title="GNSS",
+            plural="GNSS fixes",
+            short="fixes",
+            unknown="the direction of north",
+            read=_later("gnss", "read_fix"),
+            align=_later("gnss", "align_fixes"),
+            stretch=FIX_STRETCH,
+            early=False,
+        ),
         ReadingFormat(
             role="pose",
             field="other_slam",
