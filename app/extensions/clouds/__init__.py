@@ -25,19 +25,19 @@ def _later(module: str, name: str) -> Callable[..., Any]:
 def _formats() -> tuple[Format, ...]:
     """Return the formats of clouds, and the simulated drive through a cloud, by its address and for clouds
     that are opened as runs."""
-    from pipeline.io.readers import Format, format_of_points
+    from pipeline.io.readers import Format
 
     ply, las = _later("ply", "open_ply"), _later("las", "open_las")
     return (
-        format_of_points("whole cloud .ply", (b"ply\n", b"ply\r"), ".ply", table=ply, scans="PLY"),
-        format_of_points(
+        Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), table=ply, scans="PLY"),
+        Format(
             "whole cloud .npy or .npz",
             (b"\x93NUMPY",),
-            *(".npy", ".npz"),
+            (".npy", ".npz"),
             table=_later("numpy_file", "open_numpy"),
             scans="NumPy",
         ),
-        format_of_points("whole cloud .laz or .las", (b"LASF",), ".las", ".laz", table=las, scans="LAS"),
+        Format("whole cloud .laz or .las", (b"LASF",), (".las", ".laz"), table=las, scans="LAS"),
         Format(
             "a whole cloud",
             (),

@@ -46,7 +46,7 @@ def _is_tree_manager(names: Collection[str]) -> bool:
 @cache
 def _formats() -> tuple[AnyFormat, ...]:
     """Return the formats."""
-    from pipeline.io.readers import Format, PacketFormat, ReadingFormat, format_of_points
+    from pipeline.io.readers import Format, PacketFormat, ReadingFormat
     from pipeline.io.readers.sensor_families import CUSTOM_TYPES, HESAI_SCANS, OUSTER_PACKETS
 
     stems = "a folder of TreeManagerState_<i>.csv with trajectory.txt"
@@ -58,23 +58,23 @@ def _formats() -> tuple[AnyFormat, ...]:
             (".zip",),
             _later("victoria_park", "VictoriaParkSource"),
         ),
-        format_of_points(
+        Format(
             "whole cloud .e57",
             (b"ASTM-E57",),
-            ".e57",
+            (".e57",),
             table=_later("e57", "open_e57"),
         ),
-        format_of_points(
+        Format(
             "whole cloud as text (.xyz, .txt, .asc, .csv, .pts, .ptx)",
             (),
-            *(".xyz", ".asc", ".pts", ".ptx", ".txt", ".csv"),
+            (".xyz", ".asc", ".pts", ".ptx", ".txt", ".csv"),
             table=_later("text_points", "open_text"),
             accepts=_later("text_points", "is_text_of_points"),
         ),
-        format_of_points(
+        Format(
             "nuScenes, Boreas or NCLT .bin",
             (),
-            ".bin",
+            (".bin",),
             table=_later("bin_rows", "open_rows"),
             scans=".bin",
             accepts=_later("bin_rows", "is_of_other_data_set"),

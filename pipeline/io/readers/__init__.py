@@ -212,7 +212,7 @@ class Format:
         words: Name for the user.
         magic: Possible first bytes of the file; () if only its name identifies it.
         suffixes: Usual suffixes in lower case.
-        open: Function of URI, path and options that opens the source.
+        open: Function of URI, path and options that opens the source; by default that of files of points.
         table: Opens the table of a file of points (`PointTable`): a whole cloud or one scan. None for others.
         scans: Name of such files if they may also be the scans of a drive in a folder, e.g. "PCD"; else "".
         accepts: Whether a file with these first bytes (up to _HEAD) is of this format, for a format without
@@ -230,7 +230,7 @@ class Format:
     words: str
     magic: tuple[bytes, ...]
     suffixes: tuple[str, ...]
-    open: Opener
+    open: Opener = _points
     table: Callable[[Path], PointTable] | None = None
     scans: str = ""
     accepts: Callable[[bytes], bool] | None = None
@@ -262,27 +262,15 @@ def opener_of(kind: Format) -> Opener:
     return refused if kind.refusal else kind.open
 
 
-def format_of_points(
-    words: str,
-    magic: tuple[bytes, ...],
-    *suffixes: str,
-    table: Callable[[Path], PointTable],
-    scans: str = "",
-    accepts: Callable[[bytes], bool] | None = None,
-) -> Format:
-    """Return a format of files of points, see `Format`."""
-    return Format(words, magic, suffixes, _points, table, scans, accepts)
-
-
 FILES = (
     Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _recording),
     Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
-    format_of_points("KITTI .bin", (), ".bin", table=_later("point_files", "open_rows"), scans=".bin"),
-    format_of_points(
+    Format("KITTI .bin", (), (".bin",), table=_later("point_files", "open_rows"), scans=".bin"),
+    Format(
         ".pcd (whole cloud or scan)",
         (b"# .PCD", b"VERSION", b"FIELDS"),
-        ".pcd",
+        (".pcd",),
         table=_later("point_files", "open_pcd"),
         scans="PCD",
     ),

@@ -28,22 +28,6 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS, ROS1_TRANSFORMS = TRANSFORM_TYPES
-READ_TYPES = (
-    POINT_CLOUD,
-    VELODYNE_SCAN,
-    *HESAI_SCANS,
-    *CUSTOM_TYPES,
-    LASER_SCAN,
-    ODOMETRY,
-    IMU,
-    NAV_SAT_FIX,
-    POSE_WITH_COVARIANCE,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    CAMERA_INFO,
-    TRANSFORMS,
-    ROS1_TRANSFORMS,
-)
 
 _EXTRA = {
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
@@ -116,6 +100,8 @@ TYPES_BY_ROLE = {
     "pose": (POSE_WITH_COVARIANCE, ODOMETRY),
     "camera": (COMPRESSED_IMAGE, IMAGE),
 }
+#: Types of all messages that are read.
+READ_TYPES = (*(kind for kinds in TYPES_BY_ROLE.values() for kind in kinds), CAMERA_INFO, *TRANSFORM_TYPES)
 #: What `nearness` compares a topic with: the robot for scans (True), the LiDAR for other roles.
 _NEAREST = {False: "LiDAR by its frames or its name", True: "robot by its frame"}
 ROLES = "scan, odometry, imu, gnss, pose or camera"

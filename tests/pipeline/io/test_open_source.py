@@ -133,10 +133,10 @@ def test_folders_of_results_are_no_runs(tmp_path: Path):
 
 
 def test_no_file_is_opened_to_find_runs_in_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    texts = readers.format_of_points(
+    texts = readers.Format(
         "text",
         (),
-        ".txt",
+        (".txt",),
         table=lambda _: pytest.fail("opened"),
         accepts=lambda head: head.startswith(b"1 2 3"),
     )
