@@ -21,7 +21,7 @@ from pipeline.errors import StemmapError
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from pipeline.io.readers import Format, PacketFormat
+    from pipeline.io.readers import AnyFormat
 
 GROUP = "stemmap.extensions"
 VARIABLE = "STEMMAP_EXTENSIONS"
@@ -49,8 +49,8 @@ class Extension:
         page: Folder of JavaScript whose main.js registers parts of the dashboard, and runs.js parts of the
             page of runs (static/js/shell/extensions.js), with main.css and runs.css; each may be missing.
         formats: Returns formats of files and folders and their readers, which are tried after those of the
-            program (folders before), and of packets in ROS messages. If the extension is switched off, they
-            are refused.
+            program (folders before), of messages of LiDARs, and of readings in another frame. If the
+            extension is switched off, they are refused.
         addresses: Dotted module by the scheme of the addresses of live sources. The module has `parse(uri)`,
             which returns an `app.sources.live_address.Address`, and `connect(address, inbox)`, which
             returns an `app.robot.link.Link`.
@@ -66,7 +66,7 @@ class Extension:
     takes: Mapping[str, str] = field(default_factory=dict)
     web: Callable[[FastAPI], None] | None = None
     page: Path | None = None
-    formats: Callable[[], Iterable[Format | PacketFormat]] | None = None
+    formats: Callable[[], Iterable[AnyFormat]] | None = None
     addresses: Mapping[str, str] = field(default_factory=dict)
     sources: str = ""
 

@@ -460,8 +460,9 @@ def unread_scans(topics: Iterable[RecordedTopic]) -> list[str]:
     frames = {topic.frame for topic in read} - {""}
     is_planar = any(topic.type.endswith("/LaserScan") for topic in read)
     # Packets are those of a LiDAR whose clouds are read, except beside a planar one.
-    packets = {name for kind in packet_formats() for name in kind.msgtypes}
-    usable = {name for kind in packet_formats() if not kind.refusal for name in kind.msgtypes}
+    kinds = [kind for kind in packet_formats() if kind.sweeps is not None or kind.recording is not None]
+    packets = {name for kind in kinds for name in kind.msgtypes}
+    usable = {name for kind in kinds if not kind.refusal for name in kind.msgtypes}
     unread = [
         topic.name
         for topic in known

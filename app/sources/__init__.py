@@ -11,15 +11,15 @@ from app.extension import all_extensions, switched_off
 from pipeline.io.readers import add_formats
 
 if TYPE_CHECKING:
-    from pipeline.io.readers import Format, PacketFormat
+    from pipeline.io.readers import AnyFormat
 
 _log = logging.getLogger(__name__)
 
 
-def _formats_of_extensions() -> list[Format | PacketFormat]:
+def _formats_of_extensions() -> list[AnyFormat]:
     """Return the formats of the extensions; those of extensions that are switched off refuse their files.
     Those of an extension that fails to name them are left out, and this is logged."""
-    found: list[Format | PacketFormat] = []
+    found: list[AnyFormat] = []
     for each in sorted(all_extensions(), key=lambda each: not each.is_on):  # those that refuse come last
         if each.extension is None or each.extension.formats is None:
             continue

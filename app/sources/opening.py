@@ -27,7 +27,7 @@ import msgspec
 
 from app.common.child_process import ChildError, ChildProcess, ProtocolError, python_module
 from app.sources.live_address import is_live, parse_address
-from app.sources.one_step import check_one_step
+from app.sources.one_step import check_one_step, is_one_step
 from app.sources.request import SourceRequest
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import (
@@ -36,9 +36,7 @@ from pipeline.io.readers import (
     check_existence,
     format_of_address,
     path_of,
-    points_format,
 )
-from pipeline.io.readers import is_cloud as _is_cloud
 from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
 
@@ -195,23 +193,9 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     Raises:
         SourceError: The source cannot be read, or takes more time or memory than a file of its size should.
     """
-    if not is_cloud(uri, options):  # else the extension that opens it checks it
+    if not is_one_step(uri, options):  # else the extension that opens it checks it
         check_opening(lambda: _open_source(uri, options).truth(), uri)
     return _open_source(uri, options)
-
-
-def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
-    """Return whether a file is a whole cloud, see `pipeline.io.readers.is_cloud`; where its contents decide,
-    on Linux in a child process with limits. Of a file that cannot be read or takes too long, its format
-    decides."""
-    kind = points_format(uri)
-    if kind is None or not kind.depends_on_contents or (options is not None and options.form != "auto"):
-        return _is_cloud(uri, options)
-    try:
-        found = check_opening(lambda: _is_cloud(uri, options), uri)
-    except SourceError:
-        return kind.is_cloud
-    return _is_cloud(uri, options) if found is None else found
 
 
 def check_opening(opening: Callable[[], object], uri: str) -> bool | None:

@@ -3,40 +3,49 @@ scanner measures it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from app.extension import Extension, page_folder
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
 
-    from pipeline.io.readers import Format, Source, SourceOptions
+    from pipeline.io.readers import Format
 
 
-def _open_drive(uri: str, path: Path, options: SourceOptions) -> Source:
-    """Open a simulated drive through a cloud."""
-    from app.extensions.clouds.cloud_drive import open_drive
-
-    return open_drive(uri, path, options)
-
-
-def _check_drive(uri: str) -> None:
-    """Check the options of the address of a drive; UsageError if one is wrong."""
-    from app.extensions.clouds.drive_address import parse_drive
-
-    parse_drive(uri)
+def _later(module: str, name: str) -> Callable[..., Any]:
+    """Return a function that imports a module of this extension and calls its member when it is called."""
+    return lambda *given: getattr(import_module(f"{__name__}.{module}"), name)(*given)
 
 
 @cache
 def _formats() -> tuple[Format, ...]:
-    """Return the simulated drive through a cloud, by its address and for clouds that are opened as runs."""
+    """Return the formats of clouds, and the simulated drive through a cloud, by its address and for clouds
+    that are opened as runs."""
     from pipeline.io.readers import Format
 
+    ply, las = _later("ply", "open_ply"), _later("las", "open_las")
     return (
+        Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), table=ply, scans="PLY"),
         Format(
-            "a whole cloud", (), (), _open_drive, scheme="sim:cloud", check=_check_drive, scans_clouds=True
+            "whole cloud .npy or .npz",
+            (b"\x93NUMPY",),
+            (".npy", ".npz"),
+            table=_later("numpy_file", "open_numpy"),
+            scans="NumPy",
+        ),
+        Format("whole cloud .laz or .las", (b"LASF",), (".las", ".laz"), table=las, scans="LAS"),
+        Format(
+            "a whole cloud",
+            (),
+            (),
+            _later("cloud_drive", "open_drive"),
+            scheme="sim:cloud",
+            check=_later("drive_address", "parse_drive"),
+            form=_later("cloud_or_scan", "form_of_file"),
         ),
     )
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from app.extensions.clouds.cloud_or_scan import CloudSample
 from app.extensions.clouds.up_axis import UP, UP_UNCLEAR, turned_words, up_by_ground
-from pipeline.io.readers.cloud_or_scan import CloudSample
 from pipeline.io.readers.point_files import DEGREES, PointTable, ScanFileError
 from pipeline.types.records import Float
 

@@ -23,11 +23,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int | None:
     """Print the description of a whole cloud as lines or, with --json, as JSON, and return 0; None for
     another source. Raises StemmapError if the cloud cannot be read."""
-    from app.extensions.clouds.sources import open_cloud
-    from app.sources.opening import is_cloud
+    from app.extensions.clouds.sources import open_cloud, takes
 
     options = source_request(arguments, arguments.source).options()
-    if not is_cloud(arguments.source, options):
+    if not takes(arguments.source, options):
         return None
     cloud = open_cloud(arguments.source, options).description
     if arguments.json:

@@ -28,11 +28,10 @@ def run(arguments: argparse.Namespace) -> int | None:
     """
     name, parameters = flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag at once
 
-    from app.extensions.clouds.sources import open_cloud
-    from app.sources.opening import is_cloud
+    from app.extensions.clouds.sources import open_cloud, takes
 
     request = flags.source_request(arguments, arguments.source)
-    if not is_cloud(arguments.source, request.options()):
+    if not takes(arguments.source, request.options()):
         return None
     if arguments.stop_after is not None:
         raise ParameterError("a whole cloud has no scans", remedy="Remove --stop-after")

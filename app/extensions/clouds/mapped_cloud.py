@@ -13,10 +13,10 @@ import numpy as np
 
 from app.batch.map_frame import heights_at, read_map_frame
 from app.batch.run_folder import read_run, read_terrain
+from app.extensions.clouds.las import SYSTEM_OF_DRIVE
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_beside
-from pipeline.io.readers.las import SYSTEM_OF_DRIVE
 from pipeline.io.result_files import ODOMETRY
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.extensions.clouds.cloud_frame import FileFrame, frame_of
+from app.extensions.clouds.cloud_or_scan import CloudSample, form_of, is_decided_by_points, sample_of
 from app.extensions.clouds.records import CloudDescription
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import COORDINATE_LIMIT, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.cloud_or_scan import CloudSample, form_of, is_decided_by_points, sample_of
 from pipeline.io.readers.point_files import EXPORT, MISSING, REMEDY, PointTable, ScanFileError, open_table
 from pipeline.types.records import Float, Float32
 

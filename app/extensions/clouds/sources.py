@@ -2,17 +2,37 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.sources.opening import check_opening, is_cloud
-from pipeline.io.readers import SourceOptions
+from app.sources.opening import check_opening
+from pipeline.errors import SourceError
+from pipeline.io.readers import FILES, SourceOptions, form_of, points_format
 
 if TYPE_CHECKING:
     from app.extensions.clouds.point_cloud import PointCloud
     from app.extensions.clouds.source import CloudSource
 
 WHAT = "a whole cloud"
-takes = is_cloud
+
+
+def takes(uri: str, options: SourceOptions | None = None) -> bool:
+    """Return whether a file is a whole cloud; where its contents decide, on Linux in a child process with
+    limits. Of a file that cannot be read or takes too long, its format decides."""
+    kind, chosen = points_format(uri), options or SourceOptions()
+    if kind is None:
+        return False
+
+    def is_cloud() -> bool:
+        return form_of(Path(uri).expanduser(), chosen).is_cloud
+
+    if not kind.scans or chosen.form != "auto":
+        return is_cloud()
+    try:
+        found = check_opening(is_cloud, uri)
+    except SourceError:
+        return kind not in FILES
+    return is_cloud() if found is None else found
 
 
 def check(uri: str, options: SourceOptions | None = None) -> None:

@@ -10,11 +10,27 @@ from typing import TYPE_CHECKING, Any
 from app.extension import Extension
 
 if TYPE_CHECKING:
-    from pipeline.io.readers import Format, PacketFormat
+    from pipeline.io.readers import AnyFormat
 
 _PCAP = (
     b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x0a\x0d\x0d\x0a"
 )  # fmt: skip
+
+
+#: Shortest and longest stretch of the drive for GNSS fixes [m].
+FIX_STRETCH = 10.0, 100.0
+#: Shortest and longest stretch for poses of another SLAM [m]; short, because odometry drifts and these poses
+#: are much better than GNSS fixes.
+POSE_STRETCH = 5.0, 20.0
+#: Messages with packets that are not decoded.
+_HESAI = ("hesai_ros_driver/msg/UdpFrame", "hesai_ros_driver/msg/UdpPacket")
+_ROBOSENSE = (
+    "rslidar_msgs/msg/RslidarPacket",
+    "rslidar_msgs/msg/RslidarScan",
+    "rslidar_msg/msg/RslidarPacket",
+    "rslidar_msg/msg/RslidarScan",
+    "rscamera_msg/msg/RslidarPacket",
+)
 
 
 def _later(module: str, name: str) -> Callable[..., Any]:
@@ -28,10 +44,10 @@ def _is_tree_manager(names: Collection[str]) -> bool:
 
 
 @cache
-def _formats() -> tuple[Format | PacketFormat, ...]:
+def _formats() -> tuple[AnyFormat, ...]:
     """Return the formats."""
-    from pipeline.io.readers import Format, PacketFormat, format_of_points
-    from pipeline.io.readers.sensor_families import HESAI_SCANS, OUSTER_PACKETS
+    from pipeline.io.readers import Format, PacketFormat, ReadingFormat
+    from pipeline.io.readers.sensor_families import CUSTOM_TYPES, HESAI_SCANS, OUSTER_PACKETS
 
     stems = "a folder of TreeManagerState_<i>.csv with trajectory.txt"
     return (
@@ -42,25 +58,63 @@ def _formats() -> tuple[Format | PacketFormat, ...]:
             (".zip",),
             _later("victoria_park", "VictoriaParkSource"),
         ),
-        format_of_points(
+        Format(
             "whole cloud .e57",
             (b"ASTM-E57",),
-            ".e57",
-            by_contents=False,
+            (".e57",),
             table=_later("e57", "open_e57"),
         ),
-        format_of_points(
+        Format(
             "whole cloud as text (.xyz, .txt, .asc, .csv, .pts, .ptx)",
             (),
-            *(".xyz", ".asc", ".pts", ".ptx", ".txt", ".csv"),
-            by_contents=False,
+            (".xyz", ".asc", ".pts", ".ptx", ".txt", ".csv"),
             table=_later("text_points", "open_text"),
             accepts=_later("text_points", "is_text_of_points"),
         ),
+        Format(
+            "nuScenes, Boreas or NCLT .bin",
+            (),
+            (".bin",),
+            table=_later("bin_rows", "open_rows"),
+            scans=".bin",
+            accepts=_later("bin_rows", "is_of_other_data_set"),
+        ),
         Format(stems, (), (), _later("tree_manager", "TreeManagerSource"), is_folder=_is_tree_manager),
+        PacketFormat("messages of Livox", CUSTOM_TYPES, columns=_later("livox", "columns_of")),
         PacketFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "HesaiDecoder")),
         PacketFormat(
-            "raw packets of Ouster", OUSTER_PACKETS, recording=_later("ouster", "with_packets_decoded")
+            "raw packets of Ouster",
+            OUSTER_PACKETS,
+            recording=_later("ouster", "with_packets_decoded"),
+            driver="ouster_ros",
+        ),
+        PacketFormat("raw packets of Hesai", _HESAI, driver="hesai_ros_driver"),
+        PacketFormat("raw packets of RoboSense", _ROBOSENSE, driver="rslidar_sdk"),
+        ReadingFormat(
+            role="gnss",
+            field="gnss",
+            messages="GNSS messages",
+            title="GNSS",
+            plural="GNSS fixes",
+            short="fixes",
+            unknown="the direction of north",
+            read=_later("gnss", "read_fix"),
+            align=_later("gnss", "align_fixes"),
+            stretch=FIX_STRETCH,
+            early=False,
+        ),
+        ReadingFormat(
+            role="pose",
+            field="other_slam",
+            messages="poses of another SLAM",
+            title="other SLAM",
+            plural="Poses of another SLAM",
+            short="poses",
+            unknown="the pose of their frame",
+            read=_later("other_slam", "read_pose"),
+            align=_later("other_slam", "align_poses"),
+            stretch=POSE_STRETCH,
+            early=True,
         ),
     )
 

@@ -23,11 +23,11 @@ from pipeline.io.readers.base import (
     digest_of,
 )
 from pipeline.io.readers.container import Channel, Container, Message
+from pipeline.io.readers.message_formats import SweepDecoder
 from pipeline.io.readers.mounting import assumed_mounting
-from pipeline.io.readers.packets import SweepDecoder
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.scan_columns import sensor_of
-from pipeline.io.readers.sensor_families import FAMILIES, OUSTER, OUSTER_PACKETS, ROBOSENSE, SensorFamily
+from pipeline.io.readers.sensor_families import OUSTER, OUSTER_PACKETS
 from pipeline.types.records import Bool, Int, Scan, Sensor
 
 DATA_PORT = 2368
@@ -409,13 +409,13 @@ def _data_of(record: _Record, losses: dict[str, int]) -> tuple[int, int, int]:
     packet = buffer[first : min(first + length, end)]
     if _product(packet)[0]:
         return first, length, (address << 16) | port
-    family = _maker(packet, port)
+    maker = _maker(packet, port)
     if length in _LENGTHS and len(packet) < length:
         reason = "packets that the capture has cut"
     elif hesai.other_model(packet):
         reason = f"{_OF}{hesai.other_model(packet)}"
-    elif family is not None:
-        reason = f"{_OF}{family.name}"
+    elif maker:
+        reason = f"{_OF}{maker}"
     elif port != DATA_PORT:
         return 0, 0, 0
     elif length in _LENGTHS:
@@ -448,15 +448,23 @@ def _sensor_of_product(product: int) -> Sensor:
 
 
 _OF = "packets of "
+#: Driver of each maker, and the ports of its packets beside DATA_PORT.
+_MAKERS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "Velodyne": ("velodyne_driver", ()),
+    "Ouster": ("ouster_ros", (7502, 7503)),
+    "Hesai": ("hesai_ros_driver", ()),
+    "RoboSense": ("rslidar_sdk", (6699,)),
+    "Livox": ("livox_ros_driver2", (56000, 56001, 56300, 56301, 57000)),
+}
 #: First bytes of data packets of RoboSense.
 _ROBOSENSE = (b"\x55\xaa\x05\x0a", b"\x55\xaa\x05\x5a", b"\x55\xaa\x5a\xa5")
 
 
-def _maker(packet: bytes, port: int) -> SensorFamily | None:
-    """Return the family that a packet is of, by its first bytes or its port; None if neither is known."""
+def _maker(packet: bytes, port: int) -> str:
+    """Return the maker of a packet, by its first bytes or its port; "" if neither is known."""
     if packet[:4] in _ROBOSENSE:
-        return ROBOSENSE
-    return next((family for family in FAMILIES if port in family.ports and port != DATA_PORT), None)
+        return "RoboSense"
+    return next((maker for maker, (_, ports) in _MAKERS.items() if port in ports), "")
 
 
 def _refusal(losses: dict[str, int], uri: str) -> SourceError:
@@ -469,8 +477,8 @@ def _refusal(losses: dict[str, int], uri: str) -> SourceError:
     makers = [(number, reason) for reason, number in losses.items() if reason.startswith(_OF)]
     if makers:
         reason = max(makers)[1]
-        family = next((f for f in FAMILIES if reason.startswith(_OF + f.name)), None)
-        driver = family.driver if family else "the driver of its maker"
+        drivers = (driver for maker, (driver, _) in _MAKERS.items() if reason.startswith(_OF + maker))
+        driver = next(drivers, "the driver of its maker")
         return SourceError(
             f"the capture has {reason}, which cannot be decoded",
             where=uri,

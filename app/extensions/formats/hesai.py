@@ -243,7 +243,7 @@ def decode_hesai(
 
 
 class HesaiDecoder:
-    """Decodes the packets of one sensor, one sweep at a time, see `pipeline.io.readers.packets`."""
+    """Decodes the packets of one sensor, one sweep at a time, see `pipeline.io.readers.message_formats`."""
 
     def is_data(self, packet: bytes) -> bool:
         """Return whether the bytes are a data packet of a known model."""

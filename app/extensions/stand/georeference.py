@@ -356,7 +356,7 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
     fixes = []
     if run.of_drive and not is_live(run.uri):
         with closing(open_source(run.uri)) as source:
-            fixes = source.fixes() if isinstance(source, RosSource) else []
+            fixes = source.readings("gnss") if isinstance(source, RosSource) else []
     if not fixes:
         raise StemmapError(
             "the recording has no GNSS fixes", where=run.uri, remedy="Use control points, or place it by hand"

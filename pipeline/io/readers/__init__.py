@@ -9,16 +9,24 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
-from pipeline.io.readers.packets import PacketFormat
+from pipeline.io.readers.message_formats import PacketFormat, ReadingFormat
 
 if TYPE_CHECKING:
     from pipeline.io.readers.point_files import PointTable
 
-__all__ = ["PacketFormat", "Source", "SourceDescription", "SourceOptions", "open_source", "path_of"]
+__all__ = [
+    "PacketFormat",
+    "ReadingFormat",
+    "Source",
+    "SourceDescription",
+    "SourceOptions",
+    "open_source",
+    "path_of",
+]
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+]+):")
 _LIVE = ("udp", "tcp", "ros2")
@@ -48,7 +56,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
             names = runs_in(path)
             if len(names) == 1:
                 return open_source(str(path / names[0]), chosen)
-        return _find_opener(path, uri, chosen)(uri, path, chosen)
+        return _find_opener(path, uri)(uri, path, chosen)
     except RuntimeError as error:  # the home folder of an unknown user
         raise SourceError("there is no such user", where=uri, remedy="Look at the path.") from error
     except (OSError, MemoryError) as error:
@@ -108,9 +116,8 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
     raise UsageError(f"unknown kind of source {scheme!r}", where=uri, remedy=readable())
 
 
-def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
-    """Return the opener for a path. `uri` is the path as the user wrote it, for errors; of the options the
-    form of a file of points is used.
+def _find_opener(path: Path, uri: str) -> Opener:
+    """Return the opener for a path. `uri` is the path as the user wrote it, for errors.
 
     Raises:
         SourceError: The path does not exist, is an empty file, is neither a file nor a folder, or has an
@@ -139,8 +146,6 @@ def _find_opener(path: Path, uri: str, options: SourceOptions) -> Opener:
             remedy="Compare it with the original: if that is empty too, nothing was recorded.",
         )
     kind = file_format(path, head)
-    if kind is not None and kind.table is not None and not kind.refusal:
-        return _cloud if is_cloud(str(path), options) else _scans
     if kind is None:
         promised = expected_format(path)
         what = (
@@ -165,13 +170,38 @@ _recording: Opener = _later("live", "open_recording")
 _scans: Opener = _later("scan_folder", "ScanFolder")
 
 
-def _cloud(uri: str, path: Path, options: SourceOptions) -> Source:
-    """Open a whole cloud as a run of scans, by the format that does so; SourceError if there is none."""
-    kind = next((kind for kind in formats() if kind.scans_clouds), None)
-    if kind is None:
-        remedy = "Open it as a scan (--as scan, `SourceOptions.form`)"
-        raise SourceError("a whole cloud has no scans", where=uri, remedy=remedy)
-    return opener_of(kind)(uri, path, options)
+@dataclass(frozen=True, slots=True)
+class Form:
+    """What a file of points is.
+
+    Attributes:
+        is_cloud: Whether it is a whole cloud; else it is one scan.
+        why: Reason for people, as the end of a sentence with "because"; "" if its points do not decide.
+    """
+
+    is_cloud: bool
+    why: str = ""
+
+    @property
+    def words(self) -> str:
+        """The decision, its reason and the flag that changes it."""
+        forms = ("a whole cloud", "one scan (--as scan)"), ("one scan", "a whole cloud (--as cloud)")
+        kind, other = forms[0 if self.is_cloud else 1]
+        return f"taken as {kind}, because {self.why}; it can be read as {other}"
+
+
+def form_of(path: Path, options: SourceOptions | None) -> Form:
+    """Return whether a file of points is a whole cloud or one scan, see `Format.form`; a scan if no format
+    opens whole clouds."""
+    form = next((kind.form for kind in formats() if kind.form is not None), None)
+    return Form(False) if form is None else form(path, options)
+
+
+def _points(uri: str, path: Path, options: SourceOptions) -> Source:
+    """Open a file of points: one scan, or a whole cloud as a run, by the format that does so."""
+    if not form_of(path, options).is_cloud:
+        return _scans(uri, path, options)
+    return opener_of(next(kind for kind in formats() if kind.form is not None))(uri, path, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,16 +212,17 @@ class Format:
         words: Name for the user.
         magic: Possible first bytes of the file; () if only its name identifies it.
         suffixes: Usual suffixes in lower case.
-        open: Function of URI, path and options that opens the source.
-        is_cloud: Whether it is usually a whole cloud.
-        depends_on_contents: Whether its contents decide that, see `cloud_or_scan`.
+        open: Function of URI, path and options that opens the source; by default that of files of points.
         table: Opens the table of a file of points (`PointTable`): a whole cloud or one scan. None for others.
-        accepts: Whether a file with these first bytes is of this format, for a format without magic bytes
-            whose suffixes others have, too; None for other formats.
+        scans: Name of such files if they may also be the scans of a drive in a folder, e.g. "PCD"; else "".
+        accepts: Whether a file with these first bytes (up to _HEAD) is of this format, for a format without
+            magic bytes whose suffixes others have, too; None for other formats.
         scheme: Beginning of the addresses that it opens, such as "sim:cloud"; "" for none. Options `file` and
             `truth` of such an address are files, which the dashboard lets only permitted people name.
         check: Raises UsageError for an address with other options; None for no check.
-        scans_clouds: Whether it opens whole clouds as runs of scans.
+        form: Of the format that opens whole clouds as runs: returns whether a file of points is one, by the
+            choices of the user, the format and the points; for None, whether the points of a file in a folder
+            of scans are those of a cloud. None for other formats.
         is_folder: Whether a folder with files of these names is of this format; None for a format of files.
         refusal: Why it cannot be used, as the remedy of an error; "" if it can.
     """
@@ -199,14 +230,13 @@ class Format:
     words: str
     magic: tuple[bytes, ...]
     suffixes: tuple[str, ...]
-    open: Opener
-    is_cloud: bool = False
-    depends_on_contents: bool = False
+    open: Opener = _points
     table: Callable[[Path], PointTable] | None = None
+    scans: str = ""
     accepts: Callable[[bytes], bool] | None = None
     scheme: str = ""
     check: Callable[[str], object] | None = None
-    scans_clouds: bool = False
+    form: Callable[[Path, SourceOptions | None], Form] | None = None
     is_folder: Callable[[Collection[str]], bool] | None = None
     refusal: str = ""
 
@@ -232,52 +262,27 @@ def opener_of(kind: Format) -> Opener:
     return refused if kind.refusal else kind.open
 
 
-def format_of_points(
-    words: str,
-    magic: tuple[bytes, ...],
-    *suffixes: str,
-    table: Callable[[Path], PointTable],
-    is_cloud: bool = True,
-    by_contents: bool = True,
-    accepts: Callable[[bytes], bool] | None = None,
-) -> Format:
-    """Return a format of files of points, see `Format`."""
-    opener = _cloud if is_cloud else _scans
-    return Format(words, magic, suffixes, opener, is_cloud, by_contents, table, accepts)
-
-
 FILES = (
     Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _recording),
     Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
-    format_of_points(
+    Format("KITTI .bin", (), (".bin",), table=_later("point_files", "open_rows"), scans=".bin"),
+    Format(
         ".pcd (whole cloud or scan)",
         (b"# .PCD", b"VERSION", b"FIELDS"),
-        ".pcd",
+        (".pcd",),
         table=_later("point_files", "open_pcd"),
-        is_cloud=False,
+        scans="PCD",
     ),
-    format_of_points(
-        "whole cloud .laz or .las",
-        (b"LASF",),
-        *(".laz", ".las"),
-        table=_later("las", "open_las"),
-        by_contents=False,
-    ),
-    format_of_points(
-        "whole cloud .ply", (b"ply\n", b"ply\r"), ".ply", table=_later("point_files", "open_ply")
-    ),
-    format_of_points(
-        "whole cloud .npy or .npz", (b"\x93NUMPY",), ".npy", ".npz", table=_later("point_files", "open_numpy")
-    ),
-    format_of_points("KITTI .bin", (), ".bin", table=_later("point_files", "open_rows"), is_cloud=False),
 )
 
 _MOST_NAMED = 5
-_further: list[Callable[[], Iterable[Format | PacketFormat]]] = []
+AnyFormat = Format | PacketFormat | ReadingFormat
+K = TypeVar("K")
+_further: list[Callable[[], Iterable[AnyFormat]]] = []
 
 
-def add_formats(further: Callable[[], Iterable[Format | PacketFormat]]) -> None:
+def add_formats(further: Callable[[], Iterable[AnyFormat]]) -> None:
     """Add formats to those of this package, which go first. The function is called whenever a file is
     opened."""
     _further.append(further)
@@ -285,29 +290,35 @@ def add_formats(further: Callable[[], Iterable[Format | PacketFormat]]) -> None:
 
 def formats() -> tuple[Format, ...]:
     """Return all formats of files and folders in the order in which they are tried."""
-    return (*FILES, *(kind for further in _further for kind in further() if isinstance(kind, Format)))
+    return (*FILES, *added(Format))
+
+
+def added(kind: type[K]) -> tuple[K, ...]:
+    """Return the formats of a kind that were added."""
+    return tuple(each for further in _further for each in further() if isinstance(each, kind))
 
 
 def packet_formats() -> tuple[PacketFormat, ...]:
     """Return the formats of packets in ROS messages that were added."""
-    return tuple(kind for further in _further for kind in further() if isinstance(kind, PacketFormat))
+    return added(PacketFormat)
 
 
 def readable() -> str:
     """Return what can be opened, as the remedy of an error."""
+    usable = [kind for kind in formats() if not kind.refusal]
+    scans = ", ".join(dict.fromkeys(suffix for kind in usable if kind.scans for suffix in kind.suffixes))
     folders = (
-        "a folder of .bin, .pcd, .ply, .npy, .npz, .las or .laz scans",
+        f"a folder of scans ({scans})",
         "a rosbag2 folder",
         "sim:stand and the other sim: scenarios.",
     )
-    words = (kind.words for kind in formats() if not kind.refusal and not kind.scans_clouds)
-    return "Supported formats: " + ", ".join([*words, *folders])
+    return "Supported formats: " + ", ".join([*(kind.words for kind in usable if not kind.form), *folders])
 
 
 def file_format(path: Path, head: bytes) -> Format | None:
     """Return the format of a file, None if it is unknown. The first bytes decide; the suffix decides for .npz
-    and for formats without magic bytes. A file with an unknown suffix or none has the format that accepts its
-    first bytes.
+    and for formats without magic bytes; of several with this suffix, or for an unknown suffix or none, the
+    one that accepts the first bytes.
 
     Args:
         path: The file; it is not opened.
@@ -318,10 +329,11 @@ def file_format(path: Path, head: bytes) -> Format | None:
     for kind in formats():
         if any(head.startswith(mark) for mark in kind.magic):
             return kind
-    expected = expected_format(path)
-    if expected is not None:
-        return None if expected.magic else expected
-    return next((kind for kind in formats() if kind.accepts is not None and kind.accepts(head)), None)
+    expected, suffix = expected_format(path), path.suffix.lower()
+    if expected is not None and expected.magic:
+        return None
+    kinds = (kind for kind in formats() if expected is None or suffix in kind.suffixes)
+    return next((kind for kind in kinds if kind.accepts is not None and kind.accepts(head)), expected)
 
 
 _HEAD = 64 << 10  # bytes by which a format is found
@@ -348,29 +360,6 @@ def points_format(uri: str) -> Format | None:
     except (OSError, ValueError, RuntimeError):
         return None
     return kind if kind is not None and kind.table is not None else None
-
-
-def is_cloud(uri: str, options: SourceOptions | None = None) -> bool:
-    """Return whether a file is a whole cloud, by the choice of the user, else by its format and its contents.
-    False for a file that cannot be read.
-
-    Args:
-        uri: Path as the user wrote it.
-        options: Choices of the user, of which the form is used; None for none.
-    """
-    from pipeline.io.readers.point_files import ScanFileError
-
-    kind, form = points_format(uri), "auto" if options is None else options.form
-    if kind is None or form != "auto":
-        return kind is not None and form == "cloud"
-    if not kind.depends_on_contents:
-        return kind.is_cloud
-    from pipeline.io.readers.cloud_or_scan import form_of_file
-
-    try:
-        return form_of_file(Path(uri).expanduser()).is_cloud
-    except (ScanFileError, OSError, MemoryError):
-        return kind.is_cloud  # its opening states the reason
 
 
 def is_recording(path: Path) -> bool:
@@ -449,7 +438,7 @@ def folder_opener(folder: Path) -> Opener | None:
         return _recording
     inside = folder / "velodyne"
     is_kitti = inside.is_dir() and any(inside.glob("*.bin"))
-    kinds = {".bin", ".pcd", ".ply", ".npy", ".npz", ".las", ".laz"}
-    if is_kitti or kinds.intersection(suffixes):
+    of_scans = [kind for kind in formats() if kind.scans and not set(kind.suffixes).isdisjoint(suffixes)]
+    if is_kitti or not all(kind.refusal for kind in of_scans):
         return _scans
-    return opener_of(added[0]) if added else None
+    return next((opener_of(kind) for kind in (*of_scans, *added)), None)

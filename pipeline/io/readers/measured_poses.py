@@ -1,35 +1,37 @@
-"""Poses by other sources as pose measurements in the map frame: GNSS fixes (NavSatFix) and poses of another
-SLAM (PoseWithCovarianceStamped, or a named Odometry topic).
+"""Readings in another frame, such as GNSS fixes, as pose measurements in the map frame.
 
-Fixes are projected to a plane that touches the Earth at the first fix (azimuthal equidistant, metres). The
-pose of that plane, or of the map of the other SLAM, in our map is fitted once to the odometry of the first
-stretch of the drive, by least squares in the plane (Arun, Huang, Blostein 1987). Poses of another SLAM count
-from the end of that stretch on.
+The pose of the other frame in our map is fitted once to the odometry of the first stretch of the drive, by
+least squares in the plane (Arun, Huang, Blostein 1987).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.geometry.poses import Float, Pose2, Pose3, wrap_angle
+from pipeline.geometry.poses import Float, Pose2, Pose3
+from pipeline.io.readers import added
 from pipeline.io.readers.base import SourceDescription
 from pipeline.io.readers.container import Message
+from pipeline.io.readers.message_formats import MeasuredFrame, ReadingFormat
 from pipeline.io.readers.message_time import Stamped
 from pipeline.io.readers.scan_frames import MovingLink
-from pipeline.types.records import Int, Odometry, PoseMeasurement
+from pipeline.types.records import Int, Odometry
 
 if TYPE_CHECKING:
     from pipeline.io.readers.ros_messages import TimedMessages
     from pipeline.io.readers.ros_records import RecordDecoder
+    from pipeline.io.readers.topics import Topics
 
 FEWEST = 8  # positions
 #: A larger RMS residual, in sigmas of a position, means that the positions belong to another path.
 WORST = 4.0
+#: Variance of a heading that is not measured [rad^2].
+NO_HEADING = 1e4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,315 +151,10 @@ def fit_rigid(
     return RigidFit(T_map_other, centre, known, known / spread, residual, length, rate), ""
 
 
-#: Shortest and longest stretch of the drive from which the plane is fitted [m].
-FIX_STRETCH = 10.0, 100.0
-#: Standard deviation of fixes without a covariance, and the smallest one that is believed [m].
-UNKNOWN_SIGMA, BEST_SIGMA = 3.0, 0.05
-#: Variance of a heading that is not measured [rad^2].
-NO_HEADING = 1e4
-#: Number of the shared errors of fixes, see PoseMeasurement.
-GNSS_SOURCE = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Fix:
-    """A position by GNSS.
-
-    Attributes:
-        stamp_ns: Time [ns].
-        latitude, longitude: WGS84 [deg].
-        sigma: Standard deviation of each horizontal coordinate [m].
-    """
-
-    stamp_ns: int
-    latitude: float
-    longitude: float
-    sigma: float
-
-    @classmethod
-    def of(
-        cls, stamp_ns: int, latitude: float, longitude: float, covariance: Sequence[float], kind: int
-    ) -> Fix:
-        """Return a fix from the fields of its message; the height is ignored. Its sigma is the root of the
-        mean of the variances of east and north, at least BEST_SIGMA; UNKNOWN_SIGMA if the covariance is
-        unknown.
-
-        Args:
-            stamp_ns: Time [ns].
-            latitude, longitude: WGS84 [deg].
-            covariance: Covariance of east, north, up [m^2], nine numbers by row; only the variances of east
-                and north are used.
-            kind: Field `position_covariance_type`. The covariance is unknown if it is 0, or if the mean of
-                the two variances is 0, as many drivers send it.
-
-        Raises:
-            ValueError: The position is not on Earth; or `kind` is not 0 and one of the two variances is
-                negative, not finite, or 1e8 m^2 or more.
-        """
-        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
-            raise ValueError("a position is not on Earth")
-        sigma = UNKNOWN_SIGMA
-        if kind != 0:
-            east, north = float(covariance[0]), float(covariance[4])
-            if not (0.0 <= east < 1e8 and 0.0 <= north < 1e8):
-                raise ValueError("a variance is negative, too large or not finite")
-            variance = 0.5 * (east + north)
-            if variance > 0.0:
-                sigma = max(math.sqrt(variance), BEST_SIGMA)
-        return cls(stamp_ns, latitude, longitude, sigma)
-
-
-class Plane:
-    """Projection to east and north of an origin [m].
-
-    Args:
-        latitude, longitude: The origin [deg].
-    """
-
-    def __init__(self, latitude: float, longitude: float) -> None:
-        """Prepare the projection; imports pyproj."""
-        from pyproj import Transformer
-
-        local = f"+proj=aeqd +lat_0={latitude!r} +lon_0={longitude!r} +datum=WGS84 +units=m"
-        self._transform = Transformer.from_crs("EPSG:4326", local, always_xy=True).transform
-
-    def place(self, fix: Fix) -> tuple[float, float]:
-        """Return east and north of a fix from the origin [m]."""
-        east, north = self._transform(fix.longitude, fix.latitude)
-        return float(east), float(north)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GnssFrame:
-    """Pose of the GNSS plane in the map frame.
-
-    Attributes:
-        plane: Projection of fixes.
-        fit: Pose of the plane in the map.
-        lever: Horizontal distance of the antenna from the base [m]; it counts as an error.
-    """
-
-    plane: Plane
-    fit: RigidFit
-    lever: float
-
-    @property
-    def yaw_sigma(self) -> float:
-        """Standard deviation of the direction of north [rad]."""
-        return self.fit.yaw_sigma
-
-    @property
-    def summary(self) -> str:
-        """How the fixes are used, as text for the user."""
-        return (
-            f"fixes are used; over {self.fit.length:.0f} m of the drive their distance from the path by "
-            f"odometry is {self.fit.residual:.2f} m (RMS), and north is known to "
-            f"{math.degrees(self.yaw_sigma):.1f} degrees"
-        )
-
-    def measurement(self, fix: Fix) -> PoseMeasurement:
-        """Return a fix as measurement of the position of the base in the map, with the errors of the fix, of
-        the distance of the antenna and of the plane; those of the fixes of one second count as one. Its
-        heading is unknown: yaw 0 with the variance NO_HEADING."""
-        T = self.fit.T_map_other
-        c, s = math.cos(T.yaw), math.sin(T.yaw)
-        east, north = self.plane.place(fix)
-        x = T.x + c * east - s * north
-        y = T.y + s * east + c * north
-        # The error by the lever is shared while the robot drives straight on, and changes in turns.
-        shared = self.fit.shared(x, y, math.hypot(self.fit.sigma, self.lever), self.yaw_sigma)
-        own = fix.sigma**2 * max(self.fit.rate_hz, 1.0) + self.lever**2
-        C = np.diag([own, own, NO_HEADING]) + shared @ shared.T
-        return PoseMeasurement(fix.stamp_ns, Pose2(x, y, 0.0), C, shared=shared, source=GNSS_SOURCE)
-
-
-def align_fixes(
-    fixes: Sequence[Fix], stamp_ns: Sequence[int], path: Float, lever: float = 0.0
-) -> tuple[GnssFrame | None, str]:
-    """Fit the pose of the GNSS plane in the map.
-
-    Args:
-        fixes: Fixes in the order of time; the first one is the origin of the plane.
-        stamp_ns: Times of the odometry, ascending, shape (N,) [ns].
-        path: Positions x, y of the base by odometry in the map frame, shape (N, 2 or more) [m]; further
-            columns are ignored.
-        lever: Horizontal distance of the antenna from the base [m].
-
-    Returns:
-        The frame and "", or None and the reason why there is none, see `fit_rigid`.
-    """
-    if not fixes:
-        return None, "0 fixes are too few"
-    plane = Plane(fixes[0].latitude, fixes[0].longitude)
-    positions = np.array([plane.place(fix) for fix in fixes])
-    at_ns = np.array([fix.stamp_ns for fix in fixes], dtype=np.int64)
-    sigma = np.array([fix.sigma for fix in fixes])
-    fit, why = fit_rigid(
-        at_ns, positions, sigma, stamp_ns, path[:, :2],
-        shortest=FIX_STRETCH[0], what="fixes", unknown="the direction of north",
-    )  # fmt: skip
-    return (None if fit is None else GnssFrame(plane, fit, lever)), why
-
-
-#: Shortest and longest stretch for poses of another SLAM [m]; short, because odometry drifts and these poses
-#: are much better than GNSS fixes.
-POSE_STRETCH = 5.0, 20.0
-#: Standard deviations that are added to those of the other SLAM [m, rad].
-BEST = (0.02, 0.005)
-#: Drift of the odometry during the stretch [m/sqrt m], [rad/sqrt m].
-DRIFT, TURN_DRIFT = 0.05, math.radians(0.5)
-#: A larger RMS difference to the headings by odometry means that they are not those of this robot [rad].
-SCATTER = 0.35
-#: Number of the shared errors of these poses, see PoseMeasurement.
-POSE_SOURCE = 1
-#: Squared Mahalanobis distance beyond which a pose is refused (chi-square, three degrees of freedom: 0.002
-# %).
-GATE = 25.0
-_ROWS = (0, 1, 5)  # x, y, yaw of the six rows of ROS
-
-
-class NoPoseError(ValueError):
-    """A pose of another SLAM cannot be used; the message gives the reason."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OtherPose:
-    """Pose of the base by another SLAM, in its map frame.
-
-    Attributes:
-        stamp_ns: Time [ns].
-        T_other_base: Pose of the base in the other frame.
-        covariance: Covariance of x, y [m], yaw [rad] in the other frame, shape (3, 3).
-    """
-
-    stamp_ns: int
-    T_other_base: Pose2
-    covariance: Float
-
-    @classmethod
-    def of(
-        cls,
-        stamp_ns: int,
-        T_other_child: Pose3,
-        covariance: Sequence[float],
-        T_child_base: Pose3 | None = None,
-    ) -> OtherPose:
-        """Return a pose from the fields of its message, in the plane; the variances BEST are added to its
-        covariance.
-
-        Args:
-            stamp_ns: Time [ns].
-            T_other_child: Pose in the message, of its child frame in the other frame.
-            covariance: Covariance of x, y, z [m], roll, pitch, yaw [rad], 36 numbers row by row.
-            T_child_base: Pose of the base in the child frame; None if the child frame is the base.
-
-        Raises:
-            NoPoseError: The covariance in the plane is not finite, has a magnitude of 1e12 or more, or is not
-                symmetric or not positive definite.
-        """
-        planar = np.array(covariance, dtype=np.float64).reshape(6, 6)[np.ix_(_ROWS, _ROWS)]
-        if not (np.abs(planar) < 1e12).all():
-            raise NoPoseError("a covariance is not finite")
-        C = 0.5 * (planar + planar.T)
-        if not np.allclose(planar, C, rtol=1e-3) or np.linalg.eigvalsh(C)[0] <= 0.0:
-            raise NoPoseError("a covariance is zero or not positive definite")
-        pose = T_other_child if T_child_base is None else T_other_child @ T_child_base
-        return cls(stamp_ns, pose.planar(), C + np.diag([BEST[0] ** 2, BEST[0] ** 2, BEST[1] ** 2]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OtherFrame:
-    """Pose of the map of another SLAM in the map frame.
-
-    Attributes:
-        fit: Pose of the other frame by positions.
-        sigma: Standard deviation of the shift of the frame [m], with the drift of the odometry.
-        yaw_sigma: Standard deviation of the rotation of the frame [rad], with the drift of the odometry.
-        turn: Heading in the map minus heading in the other map [rad], None when headings cannot be used.
-        turn_sigma: Standard deviation of `turn` [rad].
-        from_ns: Time of the end of the fitted stretch [ns]; only later poses are used.
-    """
-
-    fit: RigidFit
-    sigma: float
-    yaw_sigma: float
-    turn: float | None
-    turn_sigma: float
-    from_ns: int
-
-    @property
-    def summary(self) -> str:
-        """How the poses are used, as text for the user."""
-        heading = (
-            "" if self.turn is not None else "; their headings are not those of this robot and are not used"
-        )
-        return (
-            f"poses are used; over {self.fit.length:.0f} m of the drive their distance from the path by "
-            f"odometry is {self.fit.residual:.2f} m (RMS); they count from there on{heading}"
-        )
-
-    def measurement(self, pose: OtherPose) -> PoseMeasurement | None:
-        """Return the pose in the map with the errors of the pose and of the frame, and the gate GATE; those
-        of the poses of one second count as one. None for a pose that is not later than `from_ns`. If `turn`
-        is None, the heading is unknown: yaw 0 with the variance NO_HEADING."""
-        if pose.stamp_ns <= self.from_ns:
-            return None
-        T, rate = self.fit.T_map_other, max(self.fit.rate_hz, 1.0)
-        at = T @ pose.T_other_base
-        c, s = math.cos(T.yaw), math.sin(T.yaw)
-        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        C = rate * (R @ pose.covariance @ R.T)
-        shared = self.fit.shared(at.x, at.y, self.sigma, self.yaw_sigma, self.turn_sigma)
-        yaw = 0.0
-        if self.turn is None:
-            C[2], C[:, 2], shared[2] = 0.0, 0.0, 0.0
-            C[2, 2] = NO_HEADING
-        else:
-            yaw = float(wrap_angle(pose.T_other_base.yaw + self.turn))
-        C = 0.5 * (C + C.T) + shared @ shared.T
-        return PoseMeasurement(pose.stamp_ns, Pose2(at.x, at.y, yaw), C, GATE, shared, POSE_SOURCE)
-
-
-def align_poses(
-    poses: Sequence[OtherPose], stamp_ns: Sequence[int], path: Float
-) -> tuple[OtherFrame | None, str]:
-    """Fit the pose of the other frame in the map.
-
-    Args:
-        poses: Poses in the order of time.
-        stamp_ns: Times of the odometry, ascending, shape (N,) [ns].
-        path: Poses of the base by odometry in the map frame: x, y [m], yaw [rad], shape (N, 3).
-
-    Returns:
-        The frame and "", or None and the reason why there is none, see `fit_rigid`. The yaw of the frame is
-        from the positions alone. If the differences between the headings and those of the odometry scatter
-        about their mean by more than SCATTER (RMS), the headings are not used: `turn` is None.
-    """
-    at_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
-    other = np.array([pose.T_other_base.as_array() for pose in poses]).reshape(-1, 3)
-    sigma = np.array([math.sqrt(0.5 * (p.covariance[0, 0] + p.covariance[1, 1])) for p in poses])
-    fit, why = fit_rigid(
-        at_ns, other[:, :2], sigma, stamp_ns, path[:, :2],
-        shortest=POSE_STRETCH[0], what="poses", unknown="the pose of their frame",
-    )  # fmt: skip
-    if fit is None:
-        return None, why
-    ours = interpolated(at_ns, stamp_ns, np.column_stack([np.cos(path[:, 2]), np.sin(path[:, 2])]))
-    off = wrap_angle(np.arctan2(ours[:, 1], ours[:, 0]) - other[:, 2])
-    turn = math.atan2(float(np.sin(off).mean()), float(np.cos(off).mean()))
-    scatter = float(np.sqrt(np.square(wrap_angle(off - turn)).mean()))
-    # In the middle of the stretch a third of the variance of the drift has accumulated.
-    drift, turn_drift = DRIFT**2 * fit.length / 3.0, TURN_DRIFT**2 * fit.length / 3.0
-    own = math.sqrt(float(np.median([pose.covariance[2, 2] for pose in poses])))
-    heading = max(own, scatter) / math.sqrt(max(len(poses) / 10.0, 1.0))
-    return OtherFrame(
-        fit,
-        math.sqrt(fit.sigma**2 + drift),
-        math.sqrt(fit.yaw_sigma**2 + turn_drift),
-        turn if scatter <= SCATTER else None,
-        math.sqrt(heading**2 + turn_drift),
-        int(at_ns[-1]),
-    ), ""
+def readings_of(topics: Topics) -> dict[int, ReadingFormat]:
+    """Return a dict from the numbers of channels to the kind of the readings in them."""
+    kinds = [kind for kind in added(ReadingFormat) if kind.role in topics.chosen]
+    return {number: kind for kind in kinds for number in sorted(topics.numbers(kind.role))}
 
 
 # --- alignment in recordings and live ---------------------------------------------------------------
@@ -473,36 +170,6 @@ _MOST_READINGS = 60_000
 _HOPELESS = 200
 
 
-@dataclass(frozen=True, slots=True)
-class _Kind:
-    """A kind of readings in another frame.
-
-    Attributes:
-        role: "gnss" or "pose".
-        field: Field of `SourceDescription` that describes the use of the readings.
-        title, plural, short, unknown: For messages: name, plural, short plural, and what a short drive does
-            not determine.
-        read: Function of a message and its time [ns] that returns the reading, None if the message has none,
-            and the name of its frame.
-        align: Function of readings, times [ns] and poses of the odometry, and distance of the sensor from the
-            base [m] that returns the frame and "", or None and the reason.
-        shortest, longest: Distance from the start for the first fit, and for the last one [m].
-        early: Whether a recording uses the first good fit, as a live run does, or the last one.
-    """
-
-    role: str
-    field: str
-    title: str
-    plural: str
-    short: str
-    unknown: str
-    read: Callable[[Message, int], tuple[Any, str]]
-    align: Callable[[Sequence[Any], Sequence[int], Float, float], tuple[Any, str]]
-    shortest: float
-    longest: float
-    early: bool
-
-
 class FrameAlignment:
     """Collects odometry and readings of one kind until the pose of their frame is known.
 
@@ -513,7 +180,7 @@ class FrameAlignment:
         kind: Kind of the readings.
         readings, odometry: Numbers of the channels of the readings and of the odometry.
         start_ns: Time of the first scan [ns]; the pose at this time is the origin of the map.
-        early: Whether a fit before `kind.longest` is accepted.
+        early: Whether a fit before the end of `kind.stretch` is accepted.
 
     Attributes:
         refused: Reason why the readings are not used; "" while this is not decided.
@@ -522,7 +189,7 @@ class FrameAlignment:
     def __init__(
         self,
         decoder: RecordDecoder,
-        kind: _Kind,
+        kind: ReadingFormat,
         readings: frozenset[int],
         odometry: frozenset[int],
         start_ns: int,
@@ -536,12 +203,12 @@ class FrameAlignment:
         self._path: list[tuple[int, Pose3]] = []
         self._origin: tuple[int, Pose3] | None = None
         self._frame = ""
-        self._try_at = kind.shortest if early else kind.longest
+        self._try_at = kind.stretch[0] if early else kind.stretch[1]
         self._unusable, self._fault = 0, ""
         self.refused = ""
 
-    def add(self, stamped: Stamped[Message | Odometry | MovingLink]) -> Any:  # noqa: ANN401 - GnssFrame or OtherFrame
-        """Process the next message or odometry. Return the frame (GnssFrame or OtherFrame) once it is known,
+    def add(self, stamped: Stamped[Message | Odometry | MovingLink]) -> MeasuredFrame | None:
+        """Process the next message or odometry. Return the frame once it is known,
         else None; if it can never be known, `refused` is set. Messages of other channels are ignored."""
         content = stamped.content
         if isinstance(content, Odometry):
@@ -556,7 +223,7 @@ class FrameAlignment:
                 self._add_odometry(record)
         return None
 
-    def finish(self) -> tuple[Any, str]:
+    def finish(self) -> tuple[MeasuredFrame | None, str]:
         """Fit the frame to all readings; return it and "", or None and the reason why it is unknown. In both
         cases the number of damaged readings is added to the text, if there are any."""
         if self._origin is None:
@@ -575,14 +242,14 @@ class FrameAlignment:
         if not self._path or odometry.stamp_ns >= self._path[-1][0] + _APART_NS:
             self._path.append((odometry.stamp_ns, odometry.T_odom_base))
 
-    def _add_reading(self, message: Message, stamp_ns: int) -> Any:  # noqa: ANN401
+    def _add_reading(self, message: Message, stamp_ns: int) -> MeasuredFrame | None:
         """Decode and store a reading; return the frame if it is known now, else None. Damaged readings, those
         without a position and those less than _APART_NS after the last one are left out. `refused` is set
         after _HOPELESS damaged readings without a usable one, and with more than _MOST_READINGS readings and
         poses of the odometry together."""
         try:
             with np.errstate(all="ignore"):
-                reading, self._frame = self.kind.read(message, stamp_ns)
+                reading, self._frame = self.kind.read(self._decoder, message, stamp_ns)
         except Exception as error:  # as in RecordDecoder.record, which counts it
             self._unusable, self._fault = self._unusable + 1, str(error)[:200]
             if self._unusable >= _HOPELESS and not self._found:
@@ -595,25 +262,25 @@ class FrameAlignment:
             self.refused = f"the robot did not drive far enough to determine {self.kind.unknown}"
         return None if self._origin is None or self.refused else self._try_fit(self._origin[1])
 
-    def _try_fit(self, origin: Pose3) -> Any:  # noqa: ANN401
+    def _try_fit(self, origin: Pose3) -> MeasuredFrame | None:
         """Try to fit the frame; return it if the fit is good, else None.
 
         Nothing is tried until the robot is far enough from its start for the next trial. The last trial is
-        made at `kind.longest`: its frame is returned even if the fit is not good; without a frame, `refused`
-        is set to the reason. `origin` is T_odom_start at the first scan.
+        made at the end of `kind.stretch`: its frame is returned even if the fit is not good; without a frame,
+        `refused` is set to the reason. `origin` is T_odom_start at the first scan.
         """
         away = float(np.hypot(*(self._path[-1][1].t - self._path[0][1].t)[:2]))
         if away < self._try_at:
             return None
         self._try_at = _FARTHER * away
         found, why = self._fit(origin)
-        if away >= self.kind.longest:
+        if away >= self.kind.stretch[1]:
             self.refused = why
             return found
         return found if found is not None and found.yaw_sigma <= NORTH_SIGMA else None
 
-    def _fit(self, T_odom_start: Pose3) -> tuple[Any, str]:
-        """Fit the frame to all readings so far with `kind.align`. Return the frame (GnssFrame or OtherFrame)
+    def _fit(self, T_odom_start: Pose3) -> tuple[MeasuredFrame | None, str]:
+        """Fit the frame to all readings so far with `kind.align`. Return the frame
         and "", or None and the reason why it is unknown. The map frame is the planar pose `T_odom_start` of
         the base at the first scan. The horizontal distance of the sensor from the base is 0 if the transforms
         do not contain it."""
@@ -625,7 +292,7 @@ class FrameAlignment:
 
 
 class FrameAlignments:
-    """Aligns the frames of GNSS fixes and of another SLAM, and gives the frames to the decoder.
+    """Aligns the frames of readings, and gives the frames to the decoder.
 
     Args:
         decoder: Decoder of the messages; the frames are stored in its `frames`.
@@ -640,15 +307,8 @@ class FrameAlignments:
         """Choose the readings by the topics that are read; nothing is aligned."""
         self._decoder, self._messages, self._odometry = decoder, messages, messages.odometry.numbers
         topics = messages.odometry.topics
-        kinds = (
-            _Kind("gnss", "gnss", "GNSS", "GNSS fixes", "fixes", "the direction of north", decoder.fix,
-                  align_fixes, *FIX_STRETCH, early=False),
-            _Kind("pose", "other_slam", "other SLAM", "Poses of another SLAM", "poses",
-                  "the pose of their frame", decoder.other_pose,
-                  lambda poses, stamps, path, _lever: align_poses(poses, stamps, path),
-                  *POSE_STRETCH, early=True),
-        )  # fmt: skip
-        self._kinds = [(kind, topics.numbers(kind.role)) for kind in kinds if kind.role in topics.chosen]
+        kinds = dict.fromkeys(readings_of(topics).values())
+        self._kinds = [(kind, topics.numbers(kind.role)) for kind in kinds]
         self._open: list[FrameAlignment] = []
         self.numbers = frozenset[int]().union(*(numbers for _, numbers in self._kinds))
         self.notices: list[str] = []
@@ -672,7 +332,9 @@ class FrameAlignments:
                 description.start_ns or 0,
                 early=live or kind.early,
             )
-            if not (description.has_odometry if live else self._odometry):
+            if kind.refusal:
+                why = kind.refusal
+            elif not (description.has_odometry if live else self._odometry):
                 why = f"without odometry {kind.unknown} is unknown"
             elif live:
                 self._open.append(alignment)
@@ -707,7 +369,7 @@ class FrameAlignments:
                 continue
             self._open.remove(alignment)
 
-    def _align_recording(self, alignment: FrameAlignment) -> tuple[Any, str]:
+    def _align_recording(self, alignment: FrameAlignment) -> tuple[MeasuredFrame | None, str]:
         """Return the frame by the first _MOST_READINGS messages of a recording and a text to be ignored, or
         None and the reason why the frame is unknown. Reading ends when the frame is known or refused."""
         for stamped in self._messages.read(alignment.readings | self._odometry, {}, most=_MOST_READINGS):

@@ -1,23 +1,16 @@
-"""Point files as tables with one column per value: PCD, PLY, and NumPy's .npy and .npz.
+"""Point files as tables with one column per value: PCD, .bin, and the parts of other formats.
 
 A table is read part by part (a whole cloud) or at once (a scan). Headers are compared with the size of the
-file before memory is taken, and pickles are never read. The readers are our own: Open3D ends the process on
-some damaged PCD files and returns an empty cloud for others.
+file before memory is taken. The reader of PCD is our own: Open3D ends the process on some damaged PCD files
+and returns an empty cloud for others.
 """
 
 from __future__ import annotations
 
-import io
-import lzma
 import struct
-import tokenize
-import warnings
-import zipfile
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from itertools import takewhile
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,7 +21,7 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import expected_format, file_format, head_of, readable
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss
 from pipeline.io.readers.pose_files import read_rows
-from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT
+from pipeline.io.readers.scan_columns import POINT_LIMIT
 from pipeline.jit import compiled
 from pipeline.types.records import Float
 
@@ -40,15 +33,11 @@ STEP_LIMIT = 64 << 10  # bytes per point
 #: Largest compressed PCD data, which is held in memory as a whole.
 WHOLE_LIMIT = 1 << 30  # bytes
 MISSING = "points that the files promise but do not hold"
-_NPY_HEADER_LIMIT = 16 << 10  # bytes; NumPy itself refuses headers of more than 10,000
-_MOST_FIELDS = 1000
-#: What damaged data and zips raise when they are read.
-_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, struct.error)
+MOST_FIELDS = 1000
 
 
 REMEDY = "Copy the file again, or export it again"  # of a damaged file
 EXPORT = "Export it with x, y and z, as .laz or .ply"  # of a sound file with other contents
-ARRAY = "Save x, y, z as an array of numbers of shape (N, 3)"  # of a sound NumPy file with other contents
 #: Reason and remedy of a cloud whose positions are longitudes and latitudes.
 DEGREES = (
     "its positions are degrees of longitude and latitude",
@@ -162,74 +151,24 @@ def open_table(path: Path) -> PointTable:
     return kind.table(path)
 
 
-# --- rows without a header ---------------------------------------------------------------------------
-
-#: Rows of .bin files, of float32 each: KITTI, nuScenes, Boreas. Those of NCLT are whole numbers.
-_ROWS = (
-    ("KITTI .bin", ("x", "y", "z", "intensity")),
-    ("nuScenes .bin", ("x", "y", "z", "intensity", "ring")),
-    ("Boreas .bin", ("x", "y", "z", "intensity", "ring", "time")),
-)
-_NCLT = np.dtype([("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
-#: Unit and offset of the coordinates of NCLT [m], whose y points to the right and z down.
-_NCLT_UNIT, _NCLT_ZERO = 0.005, -100.0
-#: Height from the sensor that few returns of a drive exceed [m]: the LiDARs of these data sets (HDL-64E,
-#: HDL-32E, VLS-128) look up by 15 degrees at most, which is 50 m at a distance of 190 m.
-_HIGHEST = 50.0
-_TESTED_ROWS = 48_000  # bytes, whole rows of each kind
-#: Smaller files are KITTI: less than 20 rows may fit to another layout by chance.
-_LEAST = 320  # bytes
-_FITTING = 0.99  # share of rows that are sound by the right layout; the rest is damage
+_ROW = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 
 
 def open_rows(path: Path) -> PointTable:
-    """Return the table of a .bin file, whose rows have no header: those of KITTI (x, y, z and reflectance as
-    float32), unless only those of nuScenes, Boreas or NCLT give positions and reflectances.
+    """Return the table of a .bin file of KITTI: rows of x, y, z and reflectance as float32, without a header.
 
     Raises:
         ScanFileError: It is too large, or shorter than a point.
         OSError: The file cannot be read.
     """
+    return rows_table(path, "KITTI .bin", _ROW)
+
+
+def rows_table(path: Path, kind: str, dtype: np.dtype[Any]) -> PointTable:
+    """Return the table of rows without a header, see `open_rows`. An incomplete last row is a promised point,
+    which its reader counts as missing."""
     size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(_TESTED_ROWS)
-    layouts = [(kind, np.dtype([(name, "<f4") for name in names])) for kind, names in _ROWS]
-    kitti, dtype = layouts[0]
-    for kind, other in layouts if size >= _LEAST else ():
-        if _are_rows(_first_rows(head, other)):
-            return _rows_table(path, kind, other, size)
-    if size >= _LEAST and _are_rows(_metres(_first_rows(head, _NCLT))):
-        table = _rows_table(path, "NCLT .bin", _NCLT, size)
-        return replace(table, read=lambda begin: (_metres(part) for part in table.read(begin)))
-    return _rows_table(path, kitti, dtype, size)
-
-
-def _rows_table(path: Path, kind: str, dtype: np.dtype[Any], size: int) -> PointTable:
-    """Return the table of rows without a header in a file of some bytes. An incomplete last row is a promised
-    point, which its reader counts as missing."""
-    return _binary_table(path, kind, -(-size // dtype.itemsize), [_Stream(0, dtype, size)])
-
-
-def _first_rows(head: bytes, dtype: np.dtype[Any]) -> Columns:
-    """Return the columns of the whole rows at the beginning of a file."""
-    rows = np.frombuffer(head, dtype, len(head) // dtype.itemsize)
-    return {name: rows[name] for name in dtype.names or ()}
-
-
-def _metres(columns: Columns) -> Columns:
-    """Return columns of NCLT with coordinates in metres, y to the left and z up."""
-    x, y, z = (columns[axis].astype(np.float64) * _NCLT_UNIT + _NCLT_ZERO for axis in "xyz")
-    return {**columns, "x": x, "y": -y, "z": -z}
-
-
-def _are_rows(columns: Columns) -> bool:
-    """Return whether nearly all rows without NaN have coordinates of a scan and a reflectance, and there are
-    such rows."""
-    with np.errstate(invalid="ignore"):  # signalling NaN, in a damaged file
-        rows = np.column_stack([columns[name].astype(np.float64) for name in _ROWS[0][1]])
-    x, y, z, reflectance = rows[~np.isnan(rows).any(axis=1)].T
-    sound = (np.maximum(np.abs(x), np.abs(y)) < RANGE_LIMIT) & (np.abs(z) < _HIGHEST) & (reflectance >= 0.0)
-    return bool(sound.size and sound.mean() > _FITTING)
+    return binary_table(path, kind, -(-size // dtype.itemsize), [Stream(0, dtype, size)])
 
 
 def read_columns(table: PointTable, losses: dict[str, int]) -> Columns:
@@ -258,7 +197,7 @@ def read_columns(table: PointTable, losses: dict[str, int]) -> Columns:
     return columns
 
 
-def _column_names(fields: list[str]) -> list[str]:
+def column_names(fields: list[str]) -> list[str]:
     """Return the names of columns in lower case without the prefix "scalar_" of CloudCompare. Empty and
     repeated names, and "_", become "*" and the index of the column; such columns are not used."""
     names: list[str] = []
@@ -268,7 +207,7 @@ def _column_names(fields: list[str]) -> list[str]:
     return names
 
 
-def _usable(names: list[str]) -> tuple[str, ...]:
+def usable_names(names: list[str]) -> tuple[str, ...]:
     """Return the names of the columns that can be used, in their order: those that do not begin with "*".
 
     Raises:
@@ -280,7 +219,7 @@ def _usable(names: list[str]) -> tuple[str, ...]:
     return tuple(name for name in names if not name.startswith("*"))
 
 
-def _check_size(points: int, step: int) -> None:
+def check_size(points: int, step: int) -> None:
     """Check the number of points and the bytes of one point in a header.
 
     Raises:
@@ -294,20 +233,22 @@ def _check_size(points: int, step: int) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Stream:
+class Stream:
     """Binary records of the points, or of some of their columns.
 
     Attributes:
-        start: Offset of the first byte in the file, or in the member of a zip.
+        start: Offset of the first byte in the file that `open` opens.
         dtype: Type of one record.
-        room: Size [bytes] of the file, or of the unpacked member by the directory of the zip.
-        member: Name of the member in the zip; None for other files.
+        room: Size of that file [bytes].
     """
 
     start: int
     dtype: np.dtype[Any]
     room: int
-    member: str | None = None
+
+    def open(self, path: Path, stack: ExitStack) -> IO[bytes]:
+        """Return the file with the records, which the stack closes."""
+        return stack.enter_context(path.open("rb"))
 
     def records(self, path: Path, points: int, stack: ExitStack, begin: int) -> Iterator[NDArray[Any]]:
         """Yield the records of the points part by part, as structured arrays of shape (n,).
@@ -319,15 +260,9 @@ class _Stream:
             stack: Stack on which the file is opened; the caller closes it.
 
         Raises:
-            OSError: The file cannot be read.
-            _DAMAGE: The zip or its packed data is damaged.
+            Exception: The file cannot be read.
         """
-        file: IO[bytes]
-        if self.member is None:
-            file = stack.enter_context(path.open("rb"))
-        else:
-            file = stack.enter_context(stack.enter_context(zipfile.ZipFile(path)).open(self.member))
-        step = self.dtype.itemsize
+        file, step = self.open(path, stack), self.dtype.itemsize
         file.seek(self.start + begin * step)
         points -= begin
         rows = max(1, min(PART, (16 << 20) // step))
@@ -341,7 +276,9 @@ class _Stream:
             points -= whole
 
 
-def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) -> PointTable:
+def binary_table(
+    path: Path, kind: str, points: int, streams: Sequence[Stream], starts: tuple[int, ...] = ()
+) -> PointTable:
     """Return the table of streams with the same points.
 
     Args:
@@ -349,29 +286,29 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
         kind: Name of the format.
         points: Number of points by the header.
         streams: Records of the points; several streams have different columns.
+        starts: As in `PointTable`.
 
     Raises:
         ScanFileError: x, y or z is missing, sizes are too large, or the file ends before its first point.
     """
-    usable = _usable([name for stream in streams for name in stream.dtype.names or ()])
+    usable = usable_names([name for stream in streams for name in stream.dtype.names or ()])
     for stream in streams:
-        _check_size(points, stream.dtype.itemsize)
+        check_size(points, stream.dtype.itemsize)
         if points and stream.start + stream.dtype.itemsize > stream.room:
             raise ScanFileError("it ends before its first point")
 
     def read(begin: int = 0) -> Iterator[Columns]:
-        """Yield the points in parts, see PointTable; OSError or _DAMAGE if they cannot be read."""
+        """Yield the points in parts, see `PointTable`."""
         with ExitStack() as stack:
             for records in zip(*(s.records(path, points, stack, begin) for s in streams), strict=False):
                 n = min(map(len, records))
                 columns = {name: part[name][:n] for part in records for name in part.dtype.names or ()}
                 yield {name: columns[name] for name in usable}
 
-    starts = (0,) if any(stream.member is not None for stream in streams) else ()
     return PointTable(kind, points, usable, read, starts=starts)
 
 
-def _text_table(
+def text_table(
     path: Path, kind: str, points: int, dtype: np.dtype[Any], start: int, skipped: int = 0, more: bool = False
 ) -> PointTable:
     """Return the table of lines of text. Damaged lines are left out of its parts; these raise ScanFileError
@@ -389,8 +326,8 @@ def _text_table(
     Raises:
         ScanFileError: x, y or z is missing, sizes are too large, or the file is too short.
     """
-    usable = _usable(list(dtype.names or ()))
-    _check_size(points, dtype.itemsize)
+    usable = usable_names(list(dtype.names or ()))
+    check_size(points, dtype.itemsize)
     counts = [int(np.prod(dtype[name].shape)) for name in dtype.names or ()]
     first = dict(zip(dtype.names or (), np.cumsum([0, *counts]).tolist(), strict=False))
     # A point needs a digit and a separator per number.
@@ -448,11 +385,11 @@ def open_pcd(path: Path) -> PointTable:
     dtype, points, data, start, height, view = _pcd_header(head_of(path))
     kind = f"PCD {data}"
     if data == "ascii":
-        return replace(_text_table(path, kind, points, dtype, start), view=view, height=height)
+        return replace(text_table(path, kind, points, dtype, start), view=view, height=height)
     if data == "binary":
-        table = _binary_table(path, kind, points, [_Stream(start, dtype, path.stat().st_size)])
+        table = binary_table(path, kind, points, [Stream(start, dtype, path.stat().st_size)])
         return replace(table, view=view, height=height)
-    usable = _usable(list(dtype.names or ()))
+    usable = usable_names(list(dtype.names or ()))
     if points * dtype.itemsize > WHOLE_LIMIT:
         raise ScanFileError("its packed data is too large", "Write it as DATA binary")
 
@@ -503,21 +440,21 @@ def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int, int, Pos
             entries[words[0].upper()] = words[1:]
     try:
         fields, data = entries["FIELDS"], entries["DATA"][0].lower()
-        sizes = [_whole_number(word) for word in entries["SIZE"]]
-        counts = [_whole_number(word) for word in entries.get("COUNT", ["1"] * len(fields))]
-        if not len(fields) == len(sizes) == len(entries["TYPE"]) == len(counts) <= _MOST_FIELDS:
+        sizes = [whole_number(word) for word in entries["SIZE"]]
+        counts = [whole_number(word) for word in entries.get("COUNT", ["1"] * len(fields))]
+        if not len(fields) == len(sizes) == len(entries["TYPE"]) == len(counts) <= MOST_FIELDS:
             raise ScanFileError("its header names another number of fields than of sizes, types or counts")
         types = [_PCD_TYPES[kind, size] for kind, size in zip(entries["TYPE"], sizes, strict=True)]
-        width, height = _whole_number(entries["WIDTH"][0]), _whole_number(entries.get("HEIGHT", ["1"])[0])
-        points = _whole_number(entries["POINTS"][0]) if "POINTS" in entries else width * height
+        width, height = whole_number(entries["WIDTH"][0]), whole_number(entries.get("HEIGHT", ["1"])[0])
+        points = whole_number(entries["POINTS"][0]) if "POINTS" in entries else width * height
     except (KeyError, IndexError, ValueError) as error:
         raise ScanFileError(f"its header is damaged at {error}") from error
     if points != width * height:
         raise ScanFileError(f"its header promises {points} points and {width} x {height}")
     if data not in ("ascii", "binary", "binary_compressed"):
         raise ScanFileError(f"its data is of the unknown kind {data[:20]!r}")
-    _check_size(points, sum(size * count for size, count in zip(sizes, counts, strict=True)))
-    names = _column_names(fields)
+    check_size(points, sum(size * count for size, count in zip(sizes, counts, strict=True)))
+    names = column_names(fields)
     for axis in "xyz":
         column = names.index(axis) if axis in names else -1
         if column < 0 or counts[column] != 1:
@@ -541,7 +478,7 @@ def _view(words: list[str]) -> Pose3 | None:
     return None if np.allclose(pose.t, 0.0) and np.allclose(pose.R, np.eye(3)) else pose
 
 
-def _whole_number(word: str) -> int:
+def whole_number(word: str) -> int:
     """Return the integer of a word of up to 18 decimal digits.
 
     Raises:
@@ -600,393 +537,3 @@ def _unpack_lzf(block: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
                 unpacked[out + k] = unpacked[source + k]
         out += run
     return out
-
-
-# --- PLY -------------------------------------------------------------------------------------------
-
-_PLY_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
-_PLY_ORDER = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-
-@dataclass(frozen=True, slots=True)
-class _PlyElement:
-    """An element of the header.
-
-    Attributes:
-        name: Name in lower case.
-        count: Number of its records.
-        properties: Name, type of a number, and type of the count of a list ("" for a single number) of each
-            property; types as for NumPy, without byte order.
-    """
-
-    name: str
-    count: int
-    properties: list[tuple[str, str, str]]
-
-    @property
-    def has_lists(self) -> bool:
-        """Whether records have lists, and so different lengths."""
-        return any(count for _, _, count in self.properties)
-
-    @property
-    def least(self) -> int:
-        """Smallest length of a record, with empty lists [bytes]."""
-        return sum(np.dtype(count or kind).itemsize for _, kind, count in self.properties)
-
-
-def open_ply(path: Path) -> PointTable:
-    """Return the table of the first element "vertex", "point" or "points" of a PLY file. Its points are read
-    later; lists are skipped.
-
-    Raises:
-        ScanFileError: The header is damaged or promises too many points, there is no such element, it has no
-            x, y or z, or the file ends before its first point. In a text file, also if a list stands before
-            x, y and z.
-        OSError: The file cannot be read.
-    """
-    order, elements, start = _ply_header(head_of(path))
-    place = next((k for k, e in enumerate(elements) if e.name in ("vertex", "point", "points")), None)
-    if place is None:
-        raise ScanFileError("the PLY file has no vertices", EXPORT)
-    before, vertex = elements[:place], elements[place]
-    if not order:
-        return _ply_text(path, vertex, start, sum(element.count for element in before))
-    if any(element.has_lists for element in (*before, vertex)):
-        return _ply_with_lists(path, order, before, vertex, start)
-    names = _column_names([name for name, _, _ in vertex.properties])
-    dtype = np.dtype(
-        [(name, order + kind) for name, (_, kind, _) in zip(names, vertex.properties, strict=True)]
-    )
-    start += sum(element.count * element.least for element in before)
-    return _binary_table(path, "PLY binary", vertex.count, [_Stream(start, dtype, path.stat().st_size)])
-
-
-def _ply_text(path: Path, vertex: _PlyElement, start: int, skipped: int) -> PointTable:
-    """Return the table of a PLY file in text, of whose vertices the numbers before the first list are read.
-
-    Args:
-        path: The file.
-        vertex: The element of the points.
-        start: Length of the header [bytes].
-        skipped: Number of lines before the points.
-
-    Raises:
-        ScanFileError: x, y or z is missing or stands after a list, or the file is too short.
-    """
-    fixed = list(takewhile(lambda each: not each[2], vertex.properties))
-    names = _column_names([name for name, _, _ in fixed])
-    if vertex.has_lists and not set("xyz") <= set(names):
-        raise ScanFileError("its points have a list before x, y and z", EXPORT)
-    dtype = np.dtype([(name, "<" + kind) for name, (_, kind, _) in zip(names, fixed, strict=True)])
-    return _text_table(path, "PLY text", vertex.count, dtype, start, skipped, more=vertex.has_lists)
-
-
-def _ply_with_lists(
-    path: Path, order: str, before: list[_PlyElement], vertex: _PlyElement, start: int
-) -> PointTable:
-    """Return the table of a binary PLY file with lists in or before its vertices.
-
-    Args:
-        path: The file.
-        order: Byte order, "<" or ">".
-        before: Elements before the vertices.
-        vertex: The element of the points.
-        start: Length of the header [bytes].
-
-    Raises:
-        ScanFileError: x, y or z is missing, sizes are too large, or the file is too short.
-        OSError: The size of the file cannot be read.
-    """
-    names = _column_names([name if not count else "" for name, _, count in vertex.properties])
-    usable = _usable(names)
-    _check_size(vertex.count, vertex.least)
-    if (
-        start + sum(e.count * e.least for e in before) + vertex.least * bool(vertex.count)
-        > path.stat().st_size
-    ):
-        raise ScanFileError("it ends before its first point")
-
-    def read(begin: int = 0) -> Iterator[Columns]:
-        """Yield the points in parts, see PointTable; ScanFileError at a list that is too long."""
-        del begin
-        with path.open("rb") as file:
-            file.seek(start)
-            for element in before:
-                if element.has_lists:
-                    for _ in _walk(file, element, order):
-                        pass
-                else:
-                    file.seek(element.count * element.least, io.SEEK_CUR)
-            for block, at in _walk(file, vertex, order):
-                columns = {}
-                for k, (name, (_, kind, _)) in enumerate(zip(names, vertex.properties, strict=True)):
-                    if name in usable:
-                        dtype = np.dtype(order + kind)
-                        places = at[:, k, None] + np.arange(dtype.itemsize)
-                        columns[name] = block[places].view(dtype)[:, 0]
-                yield columns
-
-    return PointTable("PLY binary", vertex.count, usable, read, starts=(0,))
-
-
-_WALKED = 4 << 20  # bytes whose records are found at once
-
-
-def _walk(
-    file: IO[bytes], element: _PlyElement, order: str
-) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.int64]]]:
-    """Yield blocks of whole records of an element, and the place of each property in the block, shape (N,
-    properties) [bytes]; the file is then behind the element, or at its end.
-
-    Raises:
-        ScanFileError: A record is longer than STEP_LIMIT.
-    """
-    sizes = np.array([np.dtype(kind).itemsize for _, kind, _ in element.properties], np.int64)
-    counts = np.array([np.dtype(c).itemsize if c else 0 for _, _, c in element.properties], np.int64)
-    left, at = element.count, file.tell()
-    while left > 0:
-        file.seek(at)
-        block = np.frombuffer(file.read(_WALKED), np.uint8)
-        rows = min(left, len(block) // max(element.least, 1), _WALKED // len(sizes))
-        places = np.empty((rows, len(sizes)), np.int64)
-        found, end = _find_records(block, sizes, counts, order == ">", places)
-        if not found:
-            if len(block) > STEP_LIMIT:
-                raise ScanFileError("a list of it is too long")
-            return
-        yield block, places[:found]
-        left, at = left - found, at + end
-    file.seek(at)
-
-
-@compiled
-def _find_records(
-    block: NDArray[np.uint8],
-    sizes: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    is_big: bool,
-    places: NDArray[np.int64],
-) -> tuple[int, int]:
-    """Find records of varying length.
-
-    Args:
-        block: Bytes that begin with a record.
-        sizes: Size of a number of each property [bytes].
-        counts: Size of the count of each property that is a list [bytes]; 0 for a single number.
-        is_big: Whether counts are big endian.
-        places: Filled with the place of each property of each whole record [bytes].
-
-    Returns:
-        Number of whole records, at most that of the rows of `places`, and the end of the last one.
-    """
-    end = 0
-    for row in range(len(places)):
-        at = end
-        for k in range(len(sizes)):
-            places[row, k] = at
-            number = 1
-            if counts[k]:
-                if at + counts[k] > len(block):
-                    return row, end
-                number = 0
-                for byte in range(counts[k]):
-                    shift = counts[k] - 1 - byte if is_big else byte
-                    number += int(block[at + byte]) << (8 * shift)
-                at += counts[k]
-            at += number * sizes[k]
-            if at > len(block) or at < 0:
-                return row, end
-        end = at
-    return len(places), end
-
-
-def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
-    """Return the byte order ("<", ">", or "" for text), the elements with names in lower case, and the length
-    of the header [bytes]. Comments and unknown lines are ignored.
-
-    Raises:
-        ScanFileError: The bytes are not a complete header of a PLY file.
-    """
-    order: str | None = None
-    elements: list[_PlyElement] = []
-    at = 0
-    while (end := head.find(b"\n", at)) >= 0:
-        words = head[at:end].decode("ascii", "replace").split()
-        at = end + 1
-        try:
-            match words:
-                case ["end_header"]:
-                    if order is None:
-                        raise ScanFileError("the header of the PLY file does not say how its data is written")
-                    return order, elements, at
-                case ["format", form, *_]:
-                    order = _PLY_ORDER[form]
-                case ["element", name, number]:
-                    elements.append(_PlyElement(name.lower(), _whole_number(number), []))
-                case ["property", "list", count, kind, name] if not _PLY_TYPES[count].startswith("f"):
-                    elements[-1].properties.append((name, _PLY_TYPES[kind], _PLY_TYPES[count]))
-                case ["property", kind, name]:
-                    elements[-1].properties.append((name, _PLY_TYPES[kind], ""))
-                case ["property" | "element", *_]:
-                    raise ScanFileError("the header of the PLY file is damaged")
-        except (KeyError, IndexError, ValueError):
-            raise ScanFileError("the header of the PLY file is damaged") from None
-    raise ScanFileError("it has no header of a PLY file")
-
-
-# --- NumPy -----------------------------------------------------------------------------------------
-
-_MOST_MEMBERS = 1000
-_BEST_NAMES = ("points", "xyz", "cloud", "point_cloud", "pointcloud", "pts", "data", "arr_0")
-_HEADER_DAMAGE = (
-    *_DAMAGE, KeyError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, OverflowError
-)  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class _NumpyArray:
-    """An array of an .npy file or of a member of an .npz file.
-
-    Attributes:
-        member: Name of the array in the .npz; None for an .npy.
-        start: Length of the header [bytes].
-        room: Size [bytes] of the file, or of the unpacked member by the directory of the zip.
-        shape, dtype, fortran: Shape, type and order of the array by its header.
-    """
-
-    member: str | None
-    start: int
-    room: int
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    fortran: bool
-
-    def streams(self) -> list[_Stream]:
-        """Return the records of a table, or its columns if they are stored one after the other. The fields of
-        a structured array keep their names; the columns of a plain table are x, y, z, with four or five
-        columns also intensity, and the others are not used. Fields of text are not used either. Whether
-        there are x, y and z is not checked.
-
-        Raises:
-            ScanFileError: The array has neither the shape (N, 3 to _MOST_FIELDS) and numbers, nor the shape
-                (N,) and fields of numbers or text.
-        """
-        form = f"an array of shape {self.shape} and type {self.dtype}"[:120]
-        if len(self.shape) == 1 and self.dtype.names:
-            fields = dict(self.dtype.fields or {})
-            kinds = [fields[name][0] for name in self.dtype.names]
-            if not all(_is_number(kind) or kind.kind in "VSU" for kind in kinds):
-                raise ScanFileError(f"it holds {form}; it must be numbers", ARRAY)
-            names = _column_names(
-                [n if _is_number(k) else "" for n, k in zip(self.dtype.names, kinds, strict=True)]
-            )
-            offsets = [fields[name][1] for name in self.dtype.names]
-            record = {"names": names, "formats": kinds, "offsets": offsets, "itemsize": self.dtype.itemsize}
-            return [_Stream(self.start, np.dtype(record), self.room, self.member)]  # type: ignore[call-overload]
-        if len(self.shape) != 2 or not _is_number(self.dtype) or not 3 <= self.shape[1] <= _MOST_FIELDS:
-            raise ScanFileError(
-                f"it holds {form}; it must be (N, 3) numbers or more columns, or have fields x, y and z",
-                ARRAY,
-            )
-        # Four or five columns are those of KITTI and similar sets; six are x, y, z and a colour.
-        known = ["x", "y", "z", *(["intensity"] if self.shape[1] in (4, 5) else [])]
-        if self.fortran:
-            return [self.column(name, k) for k, name in enumerate(known)]
-        names = [*known, *(f"*{k}" for k in range(len(known), self.shape[1]))]
-        return [_Stream(self.start, np.dtype([(name, self.dtype) for name in names]), self.room, self.member)]
-
-    def column(self, name: str, number: int = 0) -> _Stream:
-        """Return the stream of the column with the index `number`, whose numbers are stored one after the
-        other, with the name `name`."""
-        start = self.start + number * self.shape[0] * self.dtype.itemsize
-        return _Stream(start, np.dtype([(name, self.dtype)]), self.room, self.member)
-
-
-def open_numpy(path: Path) -> PointTable:
-    """Return the table of an .npy or .npz file, see `_NumpyArray.streams` and `_open_npz`; errors are those
-    of these."""
-    head = head_of(path)
-    if head.startswith(b"PK"):
-        return _open_npz(path)
-    array = _npy_header(io.BytesIO(head), None, path.stat().st_size)
-    return _binary_table(path, "NumPy .npy", array.shape[0], array.streams())
-
-
-def _open_npz(path: Path) -> PointTable:
-    """Return the table of the array with a usual name (_BEST_NAMES, the first of them), else of the first
-    that is a table of points, else of arrays x, y, z and, if there is one, intensity of equal length. An
-    array that cannot be used is skipped; only the first _MOST_MEMBERS members are searched.
-
-    Raises:
-        ScanFileError: The file is damaged or has no such array.
-        OSError: The file cannot be read.
-    """
-    arrays: dict[str, _NumpyArray] = {}
-    reason = "it holds no arrays"
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for info in archive.infolist()[:_MOST_MEMBERS]:
-                if info.filename.endswith(".npy"):
-                    try:
-                        with archive.open(info) as file:
-                            array = _npy_header(file, info.filename, info.file_size)
-                            arrays[info.filename.removesuffix(".npy").lower()] = array
-                    except ScanFileError as error:
-                        reason = f"{info.filename[:40]}: {error}"
-    except _DAMAGE as error:
-        raise ScanFileError(f"the .npz file is damaged: {error}"[:200]) from None
-    for name in sorted(arrays, key=lambda name: _BEST_NAMES.index(name) if name in _BEST_NAMES else 99):
-        try:
-            kind = f"NumPy .npz, its array {name[:40]}"
-            return _binary_table(path, kind, arrays[name].shape[0], arrays[name].streams())
-        except ScanFileError as error:
-            reason = f"{name[:40]}: {error}"
-    found = {name: arrays[name] for name in ("x", "y", "z", "intensity") if name in arrays}
-    columns = {name: a for name, a in found.items() if len(a.shape) == 1 and _is_number(a.dtype)}
-    if len(columns) >= 3 and len({array.shape for array in columns.values()}) == 1:
-        streams = [array.column(name) for name, array in columns.items()]
-        return _binary_table(
-            path, "NumPy .npz, its arrays x, y and z", next(iter(columns.values())).shape[0], streams
-        )
-    raise ScanFileError(f"no array of it holds points; {reason}", ARRAY)
-
-
-def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
-    """Return the description of an array from its header.
-
-    Args:
-        file: File at the beginning of the array.
-        member: Name of the array in an .npz, None for an .npy.
-        size: Size of the file or of the unpacked member [bytes].
-
-    Raises:
-        ScanFileError: The header is damaged or of a newer version than 2.0, or the array has no dimension,
-            has more than MOST_POINTS entries along one, or holds Python objects (pickles).
-    """
-    head = io.BytesIO(file.read(_NPY_HEADER_LIMIT))  # no header decides how much is read
-    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # headers that Python 2 wrote
-            shape, fortran, dtype = read[np.lib.format.read_magic(head)](head)
-    except _HEADER_DAMAGE as error:
-        raise ScanFileError(f"the header of the array is damaged: {error}"[:160]) from None
-    if dtype.hasobject:
-        raise ScanFileError("an array of Python objects is not read, because it could run code", ARRAY)
-    if not shape or not all(0 <= n <= MOST_POINTS for n in shape) or dtype.subdtype:
-        raise ScanFileError(f"the header of the array promises the shape {shape}"[:120])
-    return _NumpyArray(member, head.tell(), size, tuple(shape), dtype, fortran)
-
-
-def _is_number(dtype: np.dtype[Any]) -> bool:
-    """Return whether a type is a real number of up to 8 bytes."""
-    return dtype.kind in "fiu" and dtype.itemsize <= 8 and not dtype.shape

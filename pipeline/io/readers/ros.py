@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import MessageSource
 from pipeline.io.readers.container import Container, Message
-from pipeline.io.readers.measured_poses import Fix, FrameAlignments
+from pipeline.io.readers.measured_poses import FrameAlignments, readings_of
 from pipeline.io.readers.message_time import Stamped, in_order_of_stamps
 from pipeline.io.readers.robot_body import body_words
 from pipeline.io.readers.ros_description import RosOpening, describe
@@ -154,7 +155,7 @@ class RosSource(MessageSource):
         topics = choose_topics(channels.values(), options.topics, uri, partial(nearness, tree, frames))
         odometry = choose_odometry(extrinsics, topics, frames, options.topics, live=live)
         scans = odometry.topics.chosen["scan"]
-        decoder = RecordDecoder(channels, tree, odometry.topics.numbers("pose"))
+        decoder = RecordDecoder(channels, tree, readings_of(odometry.topics))
         self._truth, sensor, spoilt = _attached_truth(container, uri)
         times = times_of_topic(container, decoder, scans)
         decoder.times.update(times.times)
@@ -237,18 +238,20 @@ class RosSource(MessageSource):
         """Return the ground truth attached to a simulated recording, None when there is none."""
         return self._truth
 
-    def fixes(self) -> list[Fix]:
-        """Return all GNSS fixes of the recording with their times by the clock of the source, in the order of
-        recording. Messages that are damaged, have no fix or an impossible time are left out, not counted; []
-        if there is no GNSS topic. SourceError if the recording cannot be read."""
-        found, messages = list[Fix](), self._reader.messages
-        for stamped in messages.messages(messages.odometry.topics.numbers("gnss")):
+    def readings(self, role: str) -> list[Any]:
+        """Return all readings of a role, see `ReadingFormat`, with their times by the clock of the source, in
+        the order of recording. Messages that are damaged, have no reading or an impossible time are left out,
+        not counted; [] if there is no topic. SourceError if the recording cannot be read."""
+        found, messages = list[Any](), self._reader.messages
+        kinds = readings_of(messages.odometry.topics)
+        for stamped in messages.messages([n for n, kind in kinds.items() if kind.role == role]):
             try:
-                fix, _ = self._reader.decoder.fix(stamped.content, stamped.stamp_ns)
+                kind = kinds[stamped.content.channel]
+                reading, _ = kind.read(self._reader.decoder, stamped.content, stamped.stamp_ns)
             except Exception:  # noqa: S112 - as in RecordDecoder.record
                 continue
-            if fix is not None:
-                found.append(fix)
+            if reading is not None:
+                found.append(reading)
         return found
 
     def _wanted(self) -> frozenset[int]:

@@ -10,10 +10,10 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.io.readers.container import Container
 from pipeline.io.readers.firing_order import FIRING_ORDER
-from pipeline.io.readers.livox import CUSTOM_TYPES
 from pipeline.io.readers.point_times import PointTimes, TimedScan, decide_point_times
 from pipeline.io.readers.ros_messages import TimedMessages
 from pipeline.io.readers.ros_records import RecordDecoder
+from pipeline.io.readers.sensor_families import CUSTOM_TYPES
 from pipeline.io.readers.topics import POINT_CLOUD, Topic
 from pipeline.types.records import Scan, Sensor
 from pipeline.types.units import SECOND_NS

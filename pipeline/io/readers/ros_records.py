@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +13,13 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import packet_formats
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.livox import CUSTOM_TYPES, CustomMsg, decode_custom
-from pipeline.io.readers.measured_poses import Fix, GnssFrame, NoPoseError, OtherFrame, OtherPose
+from pipeline.io.readers.message_formats import (
+    MeasuredFrame,
+    ReadingFormat,
+    SweepDecoder,
+    UnusableReadingError,
+)
 from pipeline.io.readers.message_time import header_stamp
-from pipeline.io.readers.packets import PacketFormat, SweepDecoder
 from pipeline.io.readers.point_times import (
     LONGEST_NS,
     PointTimes,
@@ -34,10 +37,10 @@ from pipeline.io.readers.scan_columns import (
     scan_of,
     timed_scan,
 )
+from pipeline.io.readers.sensor_families import CUSTOM_TYPES
 from pipeline.io.readers.topics import (
     IMU,
     LASER_SCAN,
-    NAV_SAT_FIX,
     ODOMETRY,
     POINT_CLOUD,
     VELODYNE_SCAN,
@@ -161,18 +164,7 @@ def decode_laser_scan(laser: ros2.sensor_msgs__msg__LaserScan, stamp_ns: int) ->
     )
 
 
-def _columns_of_custom(custom: CustomMsg, header_ns: int) -> dict[str, NDArray[np.generic]]:
-    """Return a dict from names to columns of a Livox CustomMsg, shape (N,). The times of the points are after
-    its stamp: by its time base if this is by the clock of the stamp (within 2 s), else the time base is taken
-    as the stamp, `header_ns` [ns]."""
-    columns = {name: custom.points[name] for name in custom.points.dtype.names or ()}
-    late_ns = custom.timebase_ns - header_ns
-    if abs(late_ns) < 2 * LONGEST_NS:
-        columns["offset_time"] = columns["offset_time"].astype(np.int64) + late_ns
-    return columns
-
-
-_NAMES = {ODOMETRY: "odometry messages", IMU: "IMU messages", NAV_SAT_FIX: "GNSS messages"}
+_NAMES = {ODOMETRY: "odometry messages", IMU: "IMU messages"}
 
 
 class RecordDecoder:
@@ -181,26 +173,31 @@ class RecordDecoder:
     Args:
         channels: Dict from numbers to channels of the recording.
         tree: Fixed transforms.
-        poses: Numbers of the channels with poses of another SLAM.
+        readings: Dict from numbers of channels to the kind of the readings in them.
 
     Attributes:
+        tree: As given.
         base: Name of the base frame; "" if there is none.
-        frames: Dict from the roles "gnss" and "pose" to the frames of their measurements, GnssFrame and
-            OtherFrame. Readings of a role that is missing are not used.
+        frames: Dict from roles to the frames of their readings. Readings of a role that is missing are not
+            used.
         levels: Whether the orientations of the IMU are used.
         times: Dict from frames to how the times of the points of their clouds are read; None for no times.
             That of a new frame is decided by its first cloud.
     """
 
     def __init__(
-        self, channels: Mapping[int, Channel], tree: TransformTree, poses: frozenset[int] = frozenset()
+        self,
+        channels: Mapping[int, Channel],
+        tree: TransformTree,
+        readings: Mapping[int, ReadingFormat] | None = None,
     ) -> None:
         """Create a decoder without a base frame and frames of measured poses."""
-        self._channels, self._tree = channels, tree
+        self._channels, self.tree = channels, tree
         self._decoders: dict[str, SweepDecoder] = {VELODYNE_SCAN: VelodyneDecoder()}
+        self._columns: dict[str, Callable[..., tuple[str, dict[str, NDArray[np.generic]]]]] = {}
         self.base = ""
-        self.frames: dict[str, GnssFrame | OtherFrame] = {}
-        self._poses = poses
+        self.frames: dict[str, MeasuredFrame] = {}
+        self._readings = readings or {}
         self.levels = True
         self.times: dict[str, PointTimes | None] = {}
 
@@ -211,26 +208,22 @@ class RecordDecoder:
             message: The message.
             stamp_ns: Time of the message [ns].
             losses: Dict from reasons to numbers of messages that cannot be used, and of packets that are not
-                data packets; increased in place. Not counted are measured poses whose frame is unknown, and
-                those up to `OtherFrame.from_ns`.
+                data packets; increased in place. Not counted are readings whose frame is unknown, and those
+                that do not count.
         """
-        channel = self._channels[message.channel]
+        channel, kind = self._channels[message.channel], self._readings.get(message.channel)
         try:
             # Damaged numbers may be of any size; the records are checked afterwards.
             with np.errstate(all="ignore"):
-                if message.channel in self._poses:
-                    return self._other_measurement(message, stamp_ns, losses)
+                if kind is not None:
+                    return self._measurement(kind, message, stamp_ns, losses)
                 if channel.msgtype == ODOMETRY:
                     return self._odometry(message, stamp_ns)
                 if channel.msgtype == IMU:
                     return self._imu(message, stamp_ns)
-                if channel.msgtype == NAV_SAT_FIX:
-                    return self._gnss_measurement(message, stamp_ns, losses)
                 scan = self.scan(message, stamp_ns, losses)[0]
         except Exception:  # the one place that catches what the generated decoders of rosbags raise
-            named = _NAMES.get(channel.msgtype, "scans")
-            if message.channel in self._poses:
-                named = "poses of another SLAM"
+            named = _NAMES.get(channel.msgtype, "scans") if kind is None else kind.messages
             count_loss(losses, f"{named} that cannot be read")
             return None
         if len(scan.points):
@@ -279,12 +272,17 @@ class RecordDecoder:
     def _decoder_of(self, msgtype: str) -> SweepDecoder:
         """Return the decoder of messages of packets; SourceError if there is none for this type."""
         if msgtype not in self._decoders:
-            found = (kind for kind in packet_formats() if msgtype in kind.msgtypes)
-            kind = next(found, PacketFormat(f"packets of the type {msgtype}", (msgtype,)))
-            if kind.refusal or kind.sweeps is None:
-                raise SourceError(f"{kind.words} need an extension", remedy=kind.refusal)
-            self._decoders[msgtype] = kind.sweeps()
+            self._decoders[msgtype] = self._of_format(msgtype, "sweeps")()
         return self._decoders[msgtype]
+
+    def _of_format(self, msgtype: str, part: str) -> Any:  # noqa: ANN401
+        """Return a part of the format of messages of a maker, see `PacketFormat`; SourceError if no format
+        that can be used has it."""
+        kind = next((kind for kind in packet_formats() if msgtype in kind.msgtypes), None)
+        if kind is None or kind.refusal or getattr(kind, part) is None:
+            remedy = "" if kind is None else kind.refusal
+            raise SourceError(f"messages of the type {msgtype} need an extension", remedy=remedy)
+        return getattr(kind, part)
 
     def timed(self, message: Message) -> tuple[str, TimedScan] | None:
         """Return the frame of a cloud and what its times are decided by; None for another type, or a cloud
@@ -310,8 +308,11 @@ class RecordDecoder:
         if channel.msgtype == POINT_CLOUD:
             cloud: ros2.sensor_msgs__msg__PointCloud2 = self.message(message)
             return frame_name(cloud.header.frame_id), cloud_columns(cloud)
-        custom = decode_custom(message.payload, channel.encoding)
-        return frame_name(custom.frame), _columns_of_custom(custom, self._header_ns(message))
+        if channel.msgtype not in self._columns:
+            self._columns[channel.msgtype] = self._of_format(channel.msgtype, "columns")
+        decoder = self._columns[channel.msgtype]
+        frame, columns = decoder(message.payload, channel.encoding, self._header_ns(message))
+        return frame_name(frame), columns
 
     def _timed_scan(
         self,
@@ -344,81 +345,31 @@ class RecordDecoder:
         """
         return decode(self._channels[message.channel], message.payload)
 
-    def fix(self, message: Message, stamp_ns: int) -> tuple[Fix | None, str]:
-        """Return a GNSS fix, None if the receiver had no fix, and the name of the frame of its antenna.
-
-        Raises:
-            ValueError: Position or variances are invalid, see `Fix.of`.
-            Exception: Of many kinds, when the message is damaged.
-        """
-        decoded: ros2.sensor_msgs__msg__NavSatFix = self.message(message)
-        frame = frame_name(decoded.header.frame_id)
-        if decoded.status.status < 0:
-            return None, frame
-        covariance = [float(number) for number in decoded.position_covariance]
-        kind = int(decoded.position_covariance_type)
-        return Fix.of(stamp_ns, float(decoded.latitude), float(decoded.longitude), covariance, kind), frame
-
-    def other_pose(self, message: Message, stamp_ns: int) -> tuple[OtherPose, str]:
-        """Return a pose of another SLAM, in the plane, and the frame in which it is given (`frame_id` of the
-        header, without leading slashes).
-
-        If fixed transforms link the child frame of the message to the base, it is the pose of the base.
-        Otherwise, and without a child frame, the pose of the message is taken as that of the base. Its
-        covariance is at least that of `OtherPose.of`.
-
-        Args:
-            message: nav_msgs/Odometry, or a type with the same header and pose.
-            stamp_ns: Time of the pose [ns].
-
-        Raises:
-            NoPoseError: The covariance in the plane is not finite, not symmetric or not positive definite;
-                zeros, which mean that it is unknown, are not either.
-            Exception: Of many kinds, when the message is damaged.
-        """
-        decoded: ros2.nav_msgs__msg__Odometry = self.message(message)  # the other type has the same fields
-        frame = frame_name(decoded.header.frame_id)
-        child = frame_name(getattr(decoded, "child_frame_id", ""))
-        linked = self._tree.find(child, self.base) if child and child != self.base else None
-        pose, covariance = decoded.pose.pose, decoded.pose.covariance
-        at = pose_of(pose.position, pose.orientation)
-        return OtherPose.of(stamp_ns, at, [float(number) for number in covariance], linked), frame
-
     def place_of(self, frame: str) -> Pose3 | None:
         """Return the pose of a frame on the robot, T_base_frame; None if no fixed transforms link it to the
         base."""
-        return self._tree.find(self.base, frame)
+        return self.tree.find(self.base, frame)
 
-    def _gnss_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
-        """Return the measurement of a fix; None if the frame of GNSS is unknown, or if the message has no
-        fix, which is counted in `losses`.
-
-        Raises:
-            Exception: Of many kinds, when the message is damaged.
-        """
-        frame = self.frames.get("gnss")
-        if not isinstance(frame, GnssFrame):
-            return None
-        fix, _ = self.fix(message, stamp_ns)
-        if fix is None:
-            count_loss(losses, "GNSS messages without a fix")
-            return None
-        return frame.measurement(fix)
-
-    def _other_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
-        """Return the measurement of a pose of another SLAM; None if its covariance is invalid (counted), its
-        frame is unknown, or it is not later than `OtherFrame.from_ns`.
+    def _measurement(
+        self, kind: ReadingFormat, message: Message, stamp_ns: int, losses: dict[str, int]
+    ) -> Record | None:
+        """Return the measurement of a reading; None if the frame of its kind is unknown, if it does not
+        count, or if the message has none or an unusable one, which is counted in `losses`.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
         """
+        if kind.role not in self.frames:
+            return None
         try:
-            pose, _ = self.other_pose(message, stamp_ns)
-        except NoPoseError as error:
-            count_loss(losses, f"poses of another SLAM: {error}")
+            reading, _ = kind.read(self, message, stamp_ns)
+        except UnusableReadingError as error:
+            count_loss(losses, f"{kind.messages}: {error}")
             return None
-        frame = self.frames.get("pose")
-        return frame.measurement(pose) if isinstance(frame, OtherFrame) else None
+        if reading is None:
+            count_loss(losses, f"{kind.messages} without a fix")
+            return None
+        return self.frames[kind.role].measurement(reading)
 
     def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
         """Return the odometry in a message, with the time `stamp_ns` [ns].
@@ -439,7 +390,7 @@ class RecordDecoder:
             Exception: Of many kinds, when the message is damaged.
         """
         decoded: ros2.sensor_msgs__msg__Imu = self.message(message)
-        linked = self._tree.find(self.base, frame_name(decoded.header.frame_id))
+        linked = self.tree.find(self.base, frame_name(decoded.header.frame_id))
         R_base_imu = np.eye(3) if linked is None else linked.R
         turn, pull, q = decoded.angular_velocity, decoded.linear_acceleration, decoded.orientation
         rates = np.array([[turn.x, turn.y, turn.z], [pull.x, pull.y, pull.z]]) @ R_base_imu.T

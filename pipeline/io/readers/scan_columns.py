@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.readers.firing_order import FIRING_ORDER, azimuth_step, turn_shares
-from pipeline.io.readers.livox import tag_noise
 from pipeline.io.readers.point_times import PointTimes, TimedScan, time_fields
 from pipeline.types.records import Bool, Float, Float32, Int, Int32, Scan, Sensor
 
@@ -197,6 +196,24 @@ def _no_returns(columns: Mapping[str, NDArray[np.generic]]) -> Bool | None:
     none = np.asarray(reach == 0) if reach is not None and reach.dtype.kind in "iu" else None
     noise = tag_noise(tag) if tag is not None and tag.dtype.kind in "iu" else None
     return noise if none is None else none if noise is None else none | noise
+
+
+#: Largest share of points that tags may call noise; above it, they mean something else.
+_NOISE_MOST = 0.5
+
+
+def tag_noise(tag: NDArray[np.generic]) -> NDArray[np.bool_] | None:
+    """Return which points the sensor calls noise, shape (N,); None if none, or more than _NOISE_MOST.
+
+    Bits 0 and 1 of a tag are the confidence by the position of a point (between two objects), bits 2 and 3 by
+    its strength (rain, fog, dust). For all models 0 is a normal point; 1 and 2 are noise with high and
+    moderate confidence for Avia, Horizon and Mid-70, points with moderate and low confidence for Mid-360 and
+    HAP; 3 is reserved, or noise with low confidence.
+    """
+    bits = tag.astype(np.uint8)
+    noise = np.isin(bits & 3, (1, 2)) | np.isin((bits >> 2) & 3, (1, 2))
+    share = float(np.mean(noise)) if len(noise) else 0.0
+    return noise if 0.0 < share <= _NOISE_MOST else None
 
 
 #: A sensor without rings whose returns are nearer to each other covers the width of a stem by many rows: the

@@ -13,9 +13,8 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import folders_of_runs, named, recordings_in
+from pipeline.io.readers import folders_of_runs, form_of, formats, named, recordings_in
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.cloud_or_scan import form_of, sample_of
 from pipeline.io.readers.firing_order import FIRING_ORDER
 from pipeline.io.readers.mounting import assumed_mounting
 from pipeline.io.readers.point_files import Columns, ScanFileError, open_table, read_columns
@@ -42,8 +41,6 @@ _TEXTS = (".txt", ".csv", ".tum")
 _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
 #: Number of unreadable files at the start after which the folder is refused.
 _TRIES = 20
-#: Points of a tile of a cloud; the form of files with fewer points is not clear.
-_TILE = 20_000
 #: Length of the steps by which two odometries are compared [m], and the share of it and the turn [rad] by
 #: which they differ with the same motion: systematic errors of wheels are less.
 _STEP, _STEP_SHARE, _STEP_TURN = 1.0, 0.1, 0.05
@@ -89,7 +86,7 @@ class ScanFolder(FileSource):
         """
         super().__init__()
         self._suffix, self._files = _scan_files(path)
-        self._kind = FORMATS[self._suffix]
+        self._kind = _names_of_scans()[self._suffix]
         self._T_file_lidar: dict[Path, Pose3] = {}
         if not self._files:
             raise SourceError(f"the folder has no {self._suffix} files", where=uri)
@@ -112,14 +109,14 @@ class ScanFolder(FileSource):
         # A relative path such as "." has no parents; links keep the folder in which they are.
         folder = folder.resolve() if ".." in folder.parts else folder.absolute()
         places = [] if path.is_file() else list(dict.fromkeys([folder, *folder.parents[:2]]))
-        if path.is_file() and options.form == "auto":
-            self._warnings += _form_words(path)
+        if path.is_file() and self._suffix == ".pcd" and (form := form_of(path, options)).why:
+            self._warnings.append(form.words)
         self._timed = False
         self._stamp = self._read_stamps(places[:2], numbers)
         self._T_base_lidar = options.T_base_lidar or Pose3.identity()
         self._poses = self._read_poses(places, numbers) or self._read_views()
         if self._poses is None and not self._timed and options.form != "scan":
-            _refuse_clouds(self._files, self._suffix, uri)
+            _refuse_clouds(self._files, uri)
         if self._poses is not None:
             self._find_frame(self._poses)
         self._times = self._decide_times()
@@ -416,30 +413,15 @@ def _texts_of_poses(place: Path) -> list[Path]:
         return []
 
 
-def _refuse_clouds(files: list[Path], suffix: str, uri: str) -> None:
-    """Raise SourceError if the first of several files in a format of whole clouds is one by its points."""
-    if len(files) < 2 or suffix not in (".las", ".laz", ".ply"):
-        return
-    try:
-        table = open_table(files[0])
-        form = form_of(table, sample_of(table))
-    except (ScanFileError, OSError):
-        return
-    if form.is_cloud and table.points >= _TILE:
+def _refuse_clouds(files: list[Path], uri: str) -> None:
+    """Raise SourceError if the first of several files is a cloud by its points."""
+    if len(files) > 1 and (form := form_of(files[0], None)).is_cloud:
+        suffix = files[0].suffix.lower()
         raise SourceError(
             f"its {len(files)} {suffix} files are clouds or tiles of one, not scans of a drive: {form.why}",
             where=uri,
             remedy="Merge the tiles into one file, or map each by itself; --as scan takes them as scans",
         )
-
-
-def _form_words(file: Path) -> list[str]:
-    """Return why one file is taken as one scan, if its contents decide that; else []."""
-    try:
-        table = open_table(file)
-        return [form_of(table, sample_of(table)).words] if table.kind.startswith("PCD") else []
-    except (ScanFileError, OSError):
-        return []
 
 
 def _view_of(file: Path) -> Pose3 | None:
@@ -461,14 +443,19 @@ def _scan_files(path: Path) -> tuple[str, list[Path]]:
     if its own is not one of a scan. Without .bin files it is .pcd, or else the most frequent
     suffix of a scan; there may be no files. OSError if it cannot be read."""
     if path.is_file():
-        return path.suffix.lower() if path.suffix.lower() in FORMATS else ".pcd", [path]
+        return path.suffix.lower() if path.suffix.lower() in _names_of_scans() else ".pcd", [path]
     inside = path / "velodyne"
     for folder in (path, inside) if inside.is_dir() else (path,):
         if bins := [file for file in folder.iterdir() if file.suffix.lower() == ".bin" and file.is_file()]:
             return ".bin", _in_order(bins)
     suffixes = [file.suffix.lower() for file in path.iterdir() if file.is_file()]
-    suffix = ".pcd" if ".pcd" in suffixes else max(FORMATS, key=suffixes.count)
+    suffix = ".pcd" if ".pcd" in suffixes else max(_names_of_scans(), key=suffixes.count)
     return suffix, _in_order([f for f in path.iterdir() if f.suffix.lower() == suffix and f.is_file()])
+
+
+def _names_of_scans() -> dict[str, str]:
+    """Return a dict from the suffixes of scans to the names of their formats."""
+    return {suffix: kind.scans for kind in formats() if kind.scans for suffix in kind.suffixes}
 
 
 def _in_order(files: list[Path]) -> list[Path]:
@@ -540,15 +527,3 @@ def _kitti_sensor(scan: Scan) -> Sensor:
     sectors = len(np.unique(np.floor(np.arctan2(points[:, 1], points[:, 0]) / np.radians(10.0))))
     dense = len(points) > 50_000 and sectors >= 30
     return sensor_of(scan, HDL_64 if dense and -27.0 < low < -20.0 and 1.0 < high < 6.0 else None)
-
-
-#: Names of the formats of scans by their suffix.
-FORMATS = {
-    ".bin": ".bin",
-    ".pcd": "PCD",
-    ".ply": "PLY",
-    ".npy": "NumPy",
-    ".npz": "NumPy",
-    ".las": "LAS",
-    ".laz": "LAS",
-}

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.io.readers.livox import CUSTOM_TYPES
-
 
 @dataclass(frozen=True, slots=True)
 class SensorFamily:
@@ -14,26 +12,18 @@ class SensorFamily:
 
     Attributes:
         name: Name of the family.
-        messages: Message types of packets and of the maker's own scans that are read.
-        packets: Message types of packets that are not decoded.
-        ports: UDP ports of raw data.
-        driver: Driver that makes clouds of raw data, for refusals.
+        messages: Message types of its packets and of its own scans.
         frames: Words in usual names of frames and topics.
     """
 
     name: str
     messages: tuple[str, ...] = ()
-    packets: tuple[str, ...] = ()
-    ports: tuple[int, ...] = ()
-    driver: str = ""
     frames: tuple[str, ...] = ()
 
 
 VELODYNE = SensorFamily(
     name="Velodyne",
     messages=("velodyne_msgs/msg/VelodyneScan",),
-    ports=(2368,),
-    driver="velodyne_driver",
     frames=("velodyne",),
 )
 #: Messages with the packets of a sweep of Hesai.
@@ -47,36 +37,26 @@ OUSTER_PACKETS = (
 OUSTER = SensorFamily(
     name="Ouster",
     messages=OUSTER_PACKETS,
-    ports=(7502, 7503),
-    driver="ouster_ros",
     frames=("os_sensor", "os_lidar", "os1", "os0", "os2", "ouster"),
 )
 HESAI = SensorFamily(
     name="Hesai",
     messages=HESAI_SCANS,
-    packets=("hesai_ros_driver/msg/UdpFrame", "hesai_ros_driver/msg/UdpPacket"),
-    ports=(2368,),
-    driver="hesai_ros_driver",
     frames=("hesai", "pandar"),
 )
 ROBOSENSE = SensorFamily(
     name="RoboSense",
-    packets=(
-        "rslidar_msgs/msg/RslidarPacket",
-        "rslidar_msgs/msg/RslidarScan",
-        "rslidar_msg/msg/RslidarPacket",
-        "rslidar_msg/msg/RslidarScan",
-        "rscamera_msg/msg/RslidarPacket",
-    ),
-    ports=(6699,),
-    driver="rslidar_sdk",
     frames=("rslidar", "robosense", "helios"),
+)
+#: One layout under three names: livox_ros_driver (ROS 1), livox_ros_driver2 (ROS 1 and 2), livox_ros2_driver.
+CUSTOM_TYPES = (
+    "livox_ros_driver/msg/CustomMsg",
+    "livox_ros_driver2/msg/CustomMsg",
+    "livox_interfaces/msg/CustomMsg",
 )
 LIVOX = SensorFamily(
     name="Livox",
     messages=CUSTOM_TYPES,
-    ports=(56000, 56001, 56300, 56301, 57000),
-    driver="livox_ros_driver2",
     frames=("livox",),
 )
 DEPTH_CAMERA = SensorFamily(
@@ -92,12 +72,7 @@ FAMILIES = (VELODYNE, OUSTER, HESAI, ROBOSENSE, LIVOX, DEPTH_CAMERA, PLANAR)
 
 def family_of_messages(msgtype: str) -> SensorFamily | None:
     """Return the family whose packets or scans have a message type; None for others, and for PointCloud2."""
-    return next((f for f in FAMILIES if msgtype in (*f.messages, *f.packets)), None)
-
-
-def family_of_packets(msgtype: str) -> SensorFamily | None:
-    """Return the family whose packets, which are not decoded, have a message type; None for other types."""
-    return next((family for family in FAMILIES if msgtype in family.packets), None)
+    return next((f for f in FAMILIES if msgtype in f.messages), None)
 
 
 def family_of(

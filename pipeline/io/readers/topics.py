@@ -15,8 +15,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers import packet_formats
 from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.container import TRANSFORM_TYPES, Channel
-from pipeline.io.readers.livox import CUSTOM_TEXT, CUSTOM_TYPES, POINT_TEXT
-from pipeline.io.readers.sensor_families import HESAI_SCANS, OUSTER, OUSTER_PACKETS, family_of_packets
+from pipeline.io.readers.sensor_families import CUSTOM_TYPES, HESAI_SCANS, OUSTER_PACKETS
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 VELODYNE_SCAN = "velodyne_msgs/msg/VelodyneScan"
@@ -29,22 +28,6 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS, ROS1_TRANSFORMS = TRANSFORM_TYPES
-READ_TYPES = (
-    POINT_CLOUD,
-    VELODYNE_SCAN,
-    *HESAI_SCANS,
-    *CUSTOM_TYPES,
-    LASER_SCAN,
-    ODOMETRY,
-    IMU,
-    NAV_SAT_FIX,
-    POSE_WITH_COVARIANCE,
-    COMPRESSED_IMAGE,
-    IMAGE,
-    CAMERA_INFO,
-    TRANSFORMS,
-    ROS1_TRANSFORMS,
-)
 
 _EXTRA = {
     "velodyne_msgs/msg/VelodynePacket": "builtin_interfaces/Time stamp\nuint8[1206] data\n",
@@ -64,8 +47,13 @@ _EXTRA = {
 }
 for _custom in CUSTOM_TYPES:
     _package = _custom.partition("/")[0]
-    _EXTRA[f"{_package}/msg/CustomPoint"] = POINT_TEXT
-    _EXTRA[_custom] = CUSTOM_TEXT.format(package=_package)
+    _EXTRA[f"{_package}/msg/CustomPoint"] = (
+        "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
+    )
+    _EXTRA[_custom] = (
+        "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+        f"{_package}/CustomPoint[] points\n"
+    )
 for _packets in HESAI_SCANS:
     _package = _packets.partition("/")[0]
     _EXTRA[f"{_package}/msg/PandarPacket"] = "builtin_interfaces/Time stamp\nuint8[1500] data\nuint32 size\n"
@@ -112,6 +100,8 @@ TYPES_BY_ROLE = {
     "pose": (POSE_WITH_COVARIANCE, ODOMETRY),
     "camera": (COMPRESSED_IMAGE, IMAGE),
 }
+#: Types of all messages that are read.
+READ_TYPES = (*(kind for kinds in TYPES_BY_ROLE.values() for kind in kinds), CAMERA_INFO, *TRANSFORM_TYPES)
 #: What `nearness` compares a topic with: the robot for scans (True), the LiDAR for other roles.
 _NEAREST = {False: "LiDAR by its frames or its name", True: "robot by its frame"}
 ROLES = "scan, odometry, imu, gnss, pose or camera"
@@ -266,16 +256,12 @@ def _refuse_packets(topics: list[Topic], where: str) -> None:
     """Raise a SourceError that names maker and driver if a topic has packets that are not decoded; else
     return."""
     for topic in topics:
-        kinds = (kind for kind in packet_formats() if topic.msgtype in kind.msgtypes and kind.refusal)
-        off = next(kinds, None)
-        if off is not None and topic.count:
-            raise SourceError(f"{topic.name} has {off.words}", where=where, remedy=off.refusal)
-        family = family_of_packets(topic.msgtype) or (OUSTER if topic.msgtype in OUSTER_PACKETS else None)
-        if family is not None and topic.count:  # of Ouster only live: those of a recording are decoded
+        kind = next((kind for kind in packet_formats() if topic.msgtype in kind.msgtypes), None)
+        if kind is not None and topic.count:
             raise SourceError(
-                f"{topic.name} has raw packets of {family.name}, which cannot be read ({topic.msgtype})",
+                f"{topic.name} has {kind.words}, which cannot be read ({topic.msgtype})",
                 where=where,
-                remedy=f"Play it through {family.driver}, and record its PointCloud2.",
+                remedy=kind.refusal or f"Play it through {kind.driver}, and record its PointCloud2.",
             )
 
 

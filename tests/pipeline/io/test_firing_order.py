@@ -16,6 +16,7 @@ from pipeline.io.readers.scan_columns import has_times, timed_scan
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.types.records import Float, Float32, Int, Scan
 from tests.pipeline.io.conftest import Opened
+from tests.pipeline.io.test_scan_folders import save
 
 TURN_NS = 100_000_000
 
@@ -119,8 +120,8 @@ def test_scans_of_a_folder_have_times_and_it_is_said(
 ):
     points, true_ns = vlp16
     for k in range(4):
-        np.save(tmp_path / f"{k:04d}.npy", points)
-    np.save(tmp_path / "0004.npy", points[::-1][np.random.default_rng(0).permutation(len(points))])
+        save(tmp_path / f"{k:04d}.pcd", points)
+    save(tmp_path / "0004.pcd", points[::-1][np.random.default_rng(0).permutation(len(points))])
     source = opened(tmp_path)
     assert any("order of the points" in text for text in source.description.warnings)
     scans = [record for record in source.records() if isinstance(record, Scan)]

@@ -130,7 +130,7 @@ def test_what_auto_chooses():
 def test_poses_from_a_file_are_told_at_the_scans(tmp_path: Path):
     (tmp_path / "scans").mkdir()
     for k in range(5):
-        write(tmp_path / "scans" / f"{1_645_000_000}.{k}50000000.npy", k)
+        write(tmp_path / "scans" / f"{1_645_000_000}.{k}50000000.pcd", k)
     (tmp_path / "way.txt").write_text(tum(curve(5)))
     source, chosen = with_odometry(open_source(str(tmp_path / "scans")), f"file:{tmp_path / 'way.txt'}")
     assert chosen.method == "file"
@@ -153,9 +153,9 @@ def test_rows_without_times_that_do_not_match_the_scans_are_told(tmp_path: Path,
     scans = tmp_path / "scans"
     scans.mkdir()
     for k in range(4 if lost is None else 5):
-        write(scans / f"{k:06d}.npy", k)
+        write(scans / f"{k:06d}.pcd", k)
     if lost is not None:
-        (scans / f"{lost:06d}.npy").write_bytes(b"no scan at all")
+        (scans / f"{lost:06d}.pcd").write_bytes(b"no scan at all")
     (tmp_path / "way.txt").write_text(matrices(curve(rows)))
     source, _ = with_odometry(open_source(str(scans)), f"file:{tmp_path / 'way.txt'}")
     for _ in range(2):
@@ -167,7 +167,7 @@ def test_rows_without_times_that_do_not_match_the_scans_are_told(tmp_path: Path,
 
 def test_what_was_chosen_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for k in range(3):
-        write(tmp_path / f"{k}.npy", 0)
+        write(tmp_path / f"{k}.pcd", 0)
     assert main(["map", str(tmp_path), "--out", str(tmp_path / "out"), "--odometry", "file:"]) == 2
     assert main(["map", str(tmp_path), "--out", str(tmp_path / "out")]) == 3  # three scans without ground
     assert "odometry: registration of the scans" in capsys.readouterr().out

@@ -16,6 +16,7 @@ from pipeline.simulation.lidar import SolidStateLidar, SpinningLidar
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, Author, Write, write_recording
+from tests.pipeline.io.test_scan_folders import save
 from tests.pipeline.io.velodyne_drive import open_drive
 
 
@@ -97,7 +98,7 @@ def test_folders_of_scans_are_levelled_too(tmp_path: Path, opened: Opened):
     run = open_drive("sim:stand?duration=2", 0.02, true)
     (tmp_path / "scans").mkdir()
     for k in range(2):
-        np.save(tmp_path / "scans" / f"{k:06d}.npy", run.sweep(k).scan.points)
+        save(tmp_path / "scans" / f"{k:06d}.pcd", run.sweep(k).scan.points)
     described = opened(tmp_path / "scans").description
     assert np.degrees(np.arccos(described.T_base_lidar.R[2] @ true.R[2])) < 6.0
     assert any("tilted by 4" in warning for warning in described.warnings)

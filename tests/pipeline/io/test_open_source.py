@@ -11,6 +11,7 @@ from pipeline.errors import SourceError
 from pipeline.io import readers
 from pipeline.io.readers import open_source, runs_in
 from tests.pipeline.io.conftest import Opened
+from tests.pipeline.io.test_scan_folders import save
 
 
 @pytest.mark.parametrize("uri", ["ros2:robot", "udp://0.0.0.0:2368"])
@@ -47,13 +48,13 @@ def test_a_folder_of_data_sets_names_the_folders_that_can_be_opened(tmp_path: Pa
 
 
 def test_recordings_in_folders_beside_other_files_are_named(tmp_path: Path):
-    np.save(tmp_path / "scan.npy", np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32))
+    save(tmp_path / "scan.pcd", np.random.default_rng(0).normal(size=(500, 3)))
     for name in ("drive", "notes"):
         (tmp_path / name).mkdir()
     (tmp_path / "drive" / "drive_0.db3").touch()
     source = open_source(str(tmp_path))
     assert "not part of this run are drive/: open each of them by its name" in source.description.warnings
-    (tmp_path / "scan.npy").unlink()
+    (tmp_path / "scan.pcd").unlink()
     for name in ("a.bag", "b.bag"):
         (tmp_path / name).touch()
     with pytest.raises(SourceError, match=r"Open what is in it: a\.bag, b\.bag, drive/\."):
@@ -132,10 +133,10 @@ def test_folders_of_results_are_no_runs(tmp_path: Path):
 
 
 def test_no_file_is_opened_to_find_runs_in_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    texts = readers.format_of_points(
+    texts = readers.Format(
         "text",
         (),
-        ".txt",
+        (".txt",),
         table=lambda _: pytest.fail("opened"),
         accepts=lambda head: head.startswith(b"1 2 3"),
     )

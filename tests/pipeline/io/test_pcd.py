@@ -163,16 +163,6 @@ def test_a_table_names_its_other_columns(tmp_path: Path):
     assert set(open_table(path).names) == {*"xyz", "ring"}
 
 
-def test_a_zip_that_is_damaged_before_its_first_point_is_refused(tmp_path: Path):
-    path = tmp_path / "cloud.npz"
-    np.savez_compressed(path, points=np.random.default_rng(1).random((200_000, 3), np.float32))
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(content)
-    with pytest.raises(ScanFileError, match="its data is damaged"):
-        read_columns(open_table(path), {})
-
-
 def test_a_cut_compressed_file_is_refused(tmp_path: Path, opened: Opened):
     path = tmp_path / "cloud.pcd"
     path.write_bytes(pcd(ROWS, "binary_compressed")[:-3])

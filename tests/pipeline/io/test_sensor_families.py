@@ -17,7 +17,6 @@ from pipeline.io.readers.sensor_families import (
     SensorFamily,
     family_of,
     family_of_messages,
-    family_of_packets,
 )
 from pipeline.io.readers.topics import TYPES_BY_ROLE
 
@@ -65,11 +64,9 @@ def test_the_family_of_a_cloud(
 
 def test_a_message_type_is_of_one_family_and_is_read_if_the_table_says_so():
     for family in FAMILIES:
-        for msgtype in (*family.messages, *family.packets):
+        for msgtype in family.messages:
             assert family_of_messages(msgtype) is family
             assert family_of((), msgtype) is family
             # Packets of Ouster become clouds before their topic is chosen.
-            is_scan = msgtype in family.messages and msgtype not in OUSTER_PACKETS
-            assert (msgtype in TYPES_BY_ROLE["scan"]) is is_scan
-            assert family_of_packets(msgtype) is (family if msgtype in family.packets else None)
+            assert (msgtype in TYPES_BY_ROLE["scan"]) is (msgtype not in OUSTER_PACKETS)
     assert family_of_messages("sensor_msgs/msg/PointCloud2") is None

@@ -111,7 +111,7 @@ def test_why_a_cloud_cannot_be_opened_is_said(cloud, monkeypatch, error, says):
     def fails(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("pipeline.io.readers.las.open_las", fails)
+    monkeypatch.setattr("app.extensions.clouds.las.open_las", fails)
     with pytest.raises(SourceError, match=says):
         open_cloud(str(cloud))
 

@@ -18,8 +18,9 @@ from hypothesis.extra import numpy as arrays
 
 from app.cli import main
 from app.extensions.clouds.point_cloud import offset_for, open_cloud
+from app.extensions.clouds.sources import takes as is_cloud
 from pipeline.errors import SourceError
-from pipeline.io.readers import is_cloud, open_source
+from pipeline.io.readers import open_source
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
 from tests.pipeline.plots import plot, write_las
 
@@ -323,7 +324,7 @@ def ply_with_lists(order: str, before: bool, points: np.ndarray, rng: np.random.
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("before", [False, True])
 def test_ply_with_lists_in_and_before_its_vertices(tmp_path, order, before, monkeypatch):
-    monkeypatch.setattr("pipeline.io.readers.point_files._WALKED", 70_000)  # in several parts
+    monkeypatch.setattr("app.extensions.clouds.ply._WALKED", 70_000)  # in several parts
     rng = np.random.default_rng(4)
     points = rng.uniform(-9.0, 9.0, (5000, 3))
     (tmp_path / "c.ply").write_bytes(ply_with_lists(order, before, points, rng))

@@ -10,9 +10,9 @@ import pytest
 
 from app.cli import main
 from app.extensions.clouds.point_cloud import open_cloud
-from app.sources.opening import is_cloud as is_cloud_in_child
+from app.extensions.clouds.sources import takes as is_cloud_in_child
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import is_cloud, open_source
+from pipeline.io.readers import form_of, open_source
 from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import Scan
 from tests.pipeline.plots import plot
@@ -34,6 +34,11 @@ def pcd(
     )
     path.write_bytes(head.encode() + table.tobytes())
     return str(path)
+
+
+def is_cloud(file: str, options: SourceOptions | None = None) -> bool:
+    """Whether a file is opened as a whole cloud."""
+    return form_of(Path(file), options or SourceOptions()).is_cloud
 
 
 def sweeps(uri: str, count: int = 2) -> list[np.ndarray]:

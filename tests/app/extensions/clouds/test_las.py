@@ -14,8 +14,8 @@ import pytest
 
 from app.cli import main
 from app.extensions.clouds.point_cloud import open_cloud
+from app.extensions.clouds.sources import takes as is_cloud
 from pipeline.errors import SourceError
-from pipeline.io.readers import is_cloud
 from pipeline.io.readers.point_files import MISSING
 from tests.pipeline.plots import PLACES, plot, write_las
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.io.readers.livox import CUSTOM_TYPES
+from pipeline.io.readers.sensor_families import CUSTOM_TYPES
+from tests.pipeline.io.livox_messages import COUNT, custom, rosette
 from tests.pipeline.io.recordings import Author
-from tests.pipeline.io.test_livox import COUNT, custom, rosette
 
 
 @pytest.mark.parametrize("kind", CUSTOM_TYPES)

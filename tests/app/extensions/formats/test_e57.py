@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.sources.one_step import is_one_step as is_cloud
 from pipeline.errors import SourceError
-from pipeline.io.readers import is_cloud
 from tests.app.extensions.formats.conftest import open_cloud
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")

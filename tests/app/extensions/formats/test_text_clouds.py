@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from app.cli import main
+from app.sources.one_step import is_one_step as is_cloud
 from pipeline.errors import SourceError
-from pipeline.io.readers import is_cloud, open_source, recordings_in
+from pipeline.io.readers import open_source, recordings_in
 from pipeline.io.readers.point_files import ScanFileError, open_table
 from tests.app.extensions.formats.conftest import open_cloud
 from tests.pipeline.plots import plot

@@ -19,7 +19,6 @@ from app.batch.run_folder import read_run
 from app.extensions.stand.georeference import check_area, projected
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
-from pipeline.io.readers.measured_poses import Fix
 from pipeline.io.readers.ros import RosSource
 from tests.app.batch.finished_runs import grid_run, write_run
 from tests.app.cli.test_commands import stemmap
@@ -206,9 +205,12 @@ def test_fixes_of_the_recording_place_the_map_in_spite_of_outliers(run, capsys, 
     places = TRUE.apply(np.stack([path.x, path.y], axis=1)) + random.normal(0, 0.3, (len(path.x), 2))
     places[::10] += 40.0  # reflections
     lon, lat = pyproj.Transformer.from_crs(25832, 4326, always_xy=True).transform(*places.T)
-    fixes = [Fix(start_ns + int(t), a, o, 0.5) for t, a, o in zip(path.stamp_ns, lat, lon, strict=True)]
+    fixes = [
+        SimpleNamespace(stamp_ns=start_ns + int(t), latitude=a, longitude=o, sigma=0.5)
+        for t, a, o in zip(path.stamp_ns, lat, lon, strict=True)
+    ]
     source = object.__new__(RosSource)
-    monkeypatch.setattr(RosSource, "fixes", lambda _source: fixes)
+    monkeypatch.setattr(RosSource, "readings", lambda _source, _role: fixes)
     monkeypatch.setattr(RosSource, "close", lambda _source: None)
     monkeypatch.setattr("app.sources.opening.open_source", lambda _uri: source)
     saved = SimpleNamespace(start_ns=start_ns)

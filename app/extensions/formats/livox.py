@@ -8,19 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-#: One layout under three names: livox_ros_driver (ROS 1), livox_ros_driver2 (ROS 1 and 2), livox_ros2_driver.
-CUSTOM_TYPES = (
-    "livox_ros_driver/msg/CustomMsg",
-    "livox_ros_driver2/msg/CustomMsg",
-    "livox_interfaces/msg/CustomMsg",
-)
-POINT_TEXT = (
-    "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
-)
-CUSTOM_TEXT = (
-    "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
-    "{package}/CustomPoint[] points\n"
-)
+from pipeline.io.readers.point_times import LONGEST_NS
+
 _POINT_BYTES = 19
 _NAMES = ("offset_time", "x", "y", "z", "reflectivity", "tag", "line")
 _FORMATS = ("u4", "f4", "f4", "f4", "u1", "u1", "u1")
@@ -89,19 +78,18 @@ def _aligned(size: int, unit: int) -> int:
     return -(-size // unit) * unit
 
 
-#: Largest share of points that tags may call noise; above it, they mean something else.
-_NOISE_MOST = 0.5
+def columns_of(payload: bytes, encoding: str, header_ns: int) -> tuple[str, dict[str, NDArray[np.generic]]]:
+    """Return the frame and a dict from names to columns of a CustomMsg, shape (N,). The times of the points
+    are after its stamp: by its time base if this is by the clock of the stamp (within 2 s), else the time
+    base is taken as the stamp.
 
-
-def tag_noise(tag: NDArray[np.generic]) -> NDArray[np.bool_] | None:
-    """Return which points the sensor calls noise, shape (N,); None if none, or more than _NOISE_MOST.
-
-    Bits 0 and 1 of a tag are the confidence by the position of a point (between two objects), bits 2 and 3 by
-    its strength (rain, fog, dust). For all models 0 is a normal point; 1 and 2 are noise with high and
-    moderate confidence for Avia, Horizon and Mid-70, points with moderate and low confidence for Mid-360 and
-    HAP; 3 is reserved, or noise with low confidence.
+    Args:
+        payload, encoding: As in `decode_custom`, also for errors.
+        header_ns: The stamp [ns].
     """
-    bits = tag.astype(np.uint8)
-    noise = np.isin(bits & 3, (1, 2)) | np.isin((bits >> 2) & 3, (1, 2))
-    share = float(np.mean(noise)) if len(noise) else 0.0
-    return noise if 0.0 < share <= _NOISE_MOST else None
+    custom = decode_custom(payload, encoding)
+    columns: dict[str, NDArray[np.generic]] = {name: custom.points[name] for name in _NAMES}
+    late_ns = custom.timebase_ns - header_ns
+    if abs(late_ns) < 2 * LONGEST_NS:
+        columns["offset_time"] = columns["offset_time"].astype(np.int64) + late_ns
+    return custom.frame, columns

@@ -12,10 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from app.extensions.formats.other_slam import GATE, OtherPose, align_poses
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers import SourceOptions
-from pipeline.io.readers.measured_poses import GATE, NoPoseError, OtherPose, align_poses
+from pipeline.io.readers.message_formats import UnusableReadingError
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import FastSlam, Motion
 from pipeline.slam.measured_pose import within_gate
@@ -68,7 +69,7 @@ def test_a_covariance_that_is_none_is_refused(entry: float):
     for row in (0, 1, 5):
         C = np.array(covariance()).reshape(6, 6)
         C[row, row] = entry
-        with pytest.raises(NoPoseError):
+        with pytest.raises(UnusableReadingError):
             OtherPose.of(0, Pose3.identity(), C.ravel().tolist())
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.io.readers.base import COORDINATE_LIMIT
+from pipeline.io.readers import FILES, Form, points_format
+from pipeline.io.readers.base import COORDINATE_LIMIT, SourceOptions
 from pipeline.io.readers.point_files import PART, Columns, PointTable, ScanFileError, open_table
 from pipeline.io.readers.point_times import time_fields
 from pipeline.io.readers.scan_columns import RING
@@ -44,26 +45,8 @@ _LARGEST = 1000.0 * COORDINATE_LIMIT  # of a coordinate in millimetres; larger o
 _SAMPLED = 400_000  # points of a sample
 _PLACES = 16  # of the file from which they are taken
 _LEAST_POINTS = 1000  # by which whole numbers are known
-
-
-@dataclass(frozen=True, slots=True)
-class Form:
-    """What a file of points is.
-
-    Attributes:
-        is_cloud: Whether it is a whole cloud; else it is one scan.
-        why: Reason for people, as the end of a sentence with "because".
-    """
-
-    is_cloud: bool
-    why: str
-
-    @property
-    def words(self) -> str:
-        """The decision, its reason and the flag that changes it."""
-        forms = ("a whole cloud", "one scan (--as scan)"), ("one scan", "a whole cloud (--as cloud)")
-        kind, other = forms[0 if self.is_cloud else 1]
-        return f"taken as {kind}, because {self.why}; it can be read as {other}"
+#: Suffixes of tiles of a cloud, and points of one; the form of files with fewer points is not clear.
+_TILES, _LEAST_OF_TILE = (".las", ".laz", ".ply"), 20_000
 
 
 def is_decided_by_points(table: PointTable) -> bool:
@@ -72,15 +55,21 @@ def is_decided_by_points(table: PointTable) -> bool:
     return table.kind.startswith(("PCD", "KITTI"))
 
 
-def form_of_file(path: Path) -> Form:
-    """Return whether a PCD, PLY, NumPy or KITTI .bin file is a whole cloud or one scan.
-
-    Raises:
-        ScanFileError: The file is damaged.
-        OSError: The file cannot be read.
-    """
-    table = open_table(path)
-    return form_of(table, sample_of(table) if is_decided_by_points(table) else None)
+def form_of_file(path: Path, options: SourceOptions | None) -> Form:
+    """Return whether a file of points is a whole cloud or one scan, see `Format.form`. A file that cannot be
+    read is what its format usually is; its opening states the reason."""
+    kind = points_format(str(path))
+    if kind is None or (options is None and path.suffix.lower() not in _TILES):
+        return Form(False)
+    if options is not None and (options.form != "auto" or not kind.scans):
+        return Form(options.form in ("auto", "cloud"))
+    try:
+        table = open_table(path)
+        if options is None:
+            return form_of(table, sample_of(table)) if table.points >= _LEAST_OF_TILE else Form(False)
+        return form_of(table, sample_of(table) if is_decided_by_points(table) else None)
+    except (ScanFileError, OSError, MemoryError):
+        return Form(options is not None and kind not in FILES)
 
 
 def form_of(table: PointTable, sample: CloudSample | None) -> Form:
