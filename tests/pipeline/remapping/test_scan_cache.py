@@ -153,7 +153,7 @@ def test_without_a_folder_to_write_to_nothing_is_stored_and_that_is_said(monkeyp
     def refused(**_: object) -> None:
         raise PermissionError
 
-    monkeypatch.setattr("pipeline.io.block_file.TemporaryFile", refused)
+    monkeypatch.setattr("pipeline.geometry.file_arrays.TemporaryFile", refused)
     with closing(ScanCaches()) as caches:
         assert len(fill(caches.of(BASE), BASE, run()[0][:2])) == 0
         assert "no folder can be written to" in caches.of(BASE).refusal
