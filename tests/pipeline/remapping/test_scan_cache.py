@@ -96,7 +96,7 @@ def test_each_set_of_segmentation_parameters_has_its_cache_and_the_last_few_are_
 
 def test_damaged_scans_are_processed_again_and_a_notice_says_so(cache):
     fill(cache, BASE, run()[0][:SCANS])
-    at, length = cache._begins[5], cache._lengths[5]
+    at, length = cache._places[5]
     cache._file.handle.seek(at + length // 2)
     cache._file.handle.write(b"damage")
     read: list[int] = []
