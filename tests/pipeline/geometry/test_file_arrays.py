@@ -13,6 +13,7 @@ import pytest
 
 from pipeline.geometry.columns import GrowingColumns
 from pipeline.geometry.file_arrays import LEAST, empty
+from pipeline.seen_area import SeenRecorder
 from tests.benchmarks.machine import anonymous_mib
 
 ROWS = 1_000_000
@@ -30,6 +31,14 @@ def test_long_columns_take_no_memory_of_the_process() -> None:
     assert anonymous_mib() - before < 4  # of 32 MB
     assert np.array_equal(columns.column(0), np.arange(ROWS))
     assert np.array_equal(columns.column(1)[:, 2], np.arange(ROWS))
+
+
+@on_linux
+def test_the_views_of_a_drive_take_no_memory_of_the_process() -> None:
+    recorder, before, view = SeenRecorder(), anonymous_mib(), np.full((2, 360), 4.0)
+    for stamp in range(10_000):
+        recorder.add(stamp, view)
+    assert anonymous_mib() - before < 5  # of 29 MB
 
 
 def open_files() -> int:
