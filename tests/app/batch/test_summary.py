@@ -45,7 +45,7 @@ def test_the_parts_of_a_long_drive_make_the_whole(steps, breaks):
 def test_a_long_drive_is_added_up_without_copies_of_it():
     rows = np.arange(1_000_000)
     still = np.zeros(len(rows))
-    path = Path(rows * 10**8, 0.1 * rows, still, still, still)
+    path = Path(rows * 10**8, np.linspace(0.0, 99_999.9, len(rows)), still, still, still)
     tracemalloc.start()
     try:
         assert driven(path) == pytest.approx((99_999.9, 99_999.9))
