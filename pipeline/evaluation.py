@@ -239,6 +239,9 @@ def pair_errors(found: Float, truth: Float) -> PairErrors:
     return PairErrors(percent, float(pairs.mean()), float(pairs.max()))
 
 
+_PATH_ROWS = 16_384  # in one tree of positions, which takes more memory than they do
+
+
 def _within(position: Float, path: Float | None, reach: float) -> Bool:
     """Return which positions are at most `reach` from a position of the path, shape (N,): all if the path is
     None, none if it is empty.
@@ -250,12 +253,15 @@ def _within(position: Float, path: Float | None, reach: float) -> Bool:
     """
     if path is None or len(position) == 0:
         return np.ones(len(position), np.bool_)
-    if len(path) == 0:
-        return np.zeros(len(position), np.bool_)
     from scipy.spatial import cKDTree
 
-    distance, _ = cKDTree(path).query(position)
-    near: Bool = distance <= reach
+    near = np.zeros(len(position), np.bool_)
+    for start in range(0, len(path), _PATH_ROWS):
+        far = np.flatnonzero(~near)
+        if not len(far):
+            break
+        distance, _ = cKDTree(path[start : start + _PATH_ROWS]).query(position[far])
+        near[far] = distance <= reach
     return near
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.geometry.columns import GrowingColumns
 from pipeline.geometry.directions import direction_bins
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.types.records import Bool, Float32, Int, Path
+from pipeline.types.records import Bool, Int, Path
 
 CELL = 0.5  # m
 RANGE = 30.0  # m; views from farther away are not recorded
@@ -194,7 +195,8 @@ class SeenRecorder:
     path also move what was observed."""
 
     def __init__(self) -> None:
-        self._views: dict[int, Float32] = {}
+        self._row_of: dict[int, int] = {}  # by time
+        self._views: GrowingColumns | None = None
 
     def add(self, stamp_ns: int, view: Float) -> None:
         """Record a scan, in place of one of the same time.
@@ -204,7 +206,11 @@ class SeenRecorder:
             view: Free range, and range up to which stems are in view, by direction in the base frame, shape
                 (2, BINS) [m], see `pipeline.front_end.SegmentedScan.view`; copied, limited to RANGE.
         """
-        self._views[stamp_ns] = np.minimum(view, RANGE).astype(np.float32)
+        if self._views is None:
+            self._views = GrowingColumns(np.zeros((0, *view.shape), np.float32))
+        row = len(self._views)
+        self._views.write(row, np.minimum(view, RANGE)[None])
+        self._row_of[stamp_ns] = row  # last, because another thread may read
 
     def area(self, path: Path) -> SeenArea:
         """Return the observed area: a scan observes the cells whose centres are at most RANGE away and at
@@ -225,10 +231,13 @@ class SeenRecorder:
         grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(*grid.T) * CELL <= RANGE + CELL]
         row_of = {stamp: row for row, stamp in enumerate(path.stamp_ns.tolist())}
-        for stamp, (free, in_view) in list(self._views.items()):  # another thread may add scans
+        recorded = list(self._row_of.items())  # another thread may add scans
+        views = np.zeros((0, 2, 1)) if self._views is None else self._views.column(0)
+        for stamp, of_view in recorded:
             row = row_of.get(stamp)
             if row is None:
                 continue
+            free, in_view = views[of_view]
             pose = Pose2(float(path.x[row]), float(path.y[row]), float(path.yaw[row]))
             place = grid + np.floor(np.array([pose.x, pose.y]) / CELL).astype(np.int64)
             local = pose.inverse().apply((place + 0.5) * CELL)

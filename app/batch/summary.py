@@ -13,17 +13,19 @@ import numpy as np
 from app.common.text import count
 from pipeline.config import Parameters
 from pipeline.evaluation import MapScores, PathError, Rate
+from pipeline.geometry.columns import rows_of
 from pipeline.geometry.poses import Float
 from pipeline.io.readers import packet_formats
 from pipeline.map_faults import DOUBTFUL
 from pipeline.odometry.synchroniser import JUMP_SPEED, PAUSE_NS
-from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
+from pipeline.types.records import Frame, Health, HealthState, Int, Path, Verdict
 
 if TYPE_CHECKING:
     from app.batch.saved_run import RunSource
     from pipeline.io.readers.base import RecordedTopic
 
 
+_ROWS = 16_384  # of a path that are added up at once: a status is sent many times a second
 MOST_SPANS = 200  # written; the rest is counted
 
 
@@ -319,12 +321,21 @@ def driven_steps(path: Path) -> Float:
     (JUMP_SPEED), because the pose was set and the robot did not drive. A pause is also longer than twice the
     lower quartile of the times between scans, because a robot may stop for each scan.
     """
+    return _steps(path, _longest_step_ns(path.stamp_ns))
+
+
+def _longest_step_ns(stamp_ns: Int) -> float:
+    """Return the longest time between two scans that is no pause [ns]."""
+    parts = (stamp_ns[k : k + _ROWS + 1] for k in range(0, len(stamp_ns) - 1, _ROWS))
+    if all((np.diff(part) <= PAUSE_NS).all() for part in parts):
+        return PAUSE_NS
+    return max(PAUSE_NS, 2 * float(np.percentile(np.diff(stamp_ns), 25, method="lower")))
+
+
+def _steps(path: Path, longest_ns: float) -> Float:
     metres: Float = np.hypot(np.diff(path.x), np.diff(path.y))
     time_ns = np.diff(path.stamp_ns)
-    usual_ns = np.percentile(time_ns, 25, method="lower") if len(time_ns) else 0
-    is_driven = (time_ns <= max(PAUSE_NS, 2 * usual_ns)) & (
-        metres <= JUMP_SPEED * np.maximum(time_ns * _NS, 0.1)
-    )
+    is_driven = (time_ns <= longest_ns) & (metres <= JUMP_SPEED * np.maximum(time_ns * _NS, 0.1))
     return np.where(is_driven, metres, 0.0)
 
 
@@ -336,10 +347,14 @@ def driven(path: Path, breaks: Iterable[int] = ()) -> tuple[float, float]:
         path: One row per scan.
         breaks: First scan of each further drive, see `breaks_of`; others than 1 to N - 1 are ignored.
     """
-    is_step = np.ones(max(len(path.x) - 1, 0), np.bool_)
-    is_step[[scan - 1 for scan in breaks if 0 < scan < len(path.x)]] = False
-    seconds = float(np.diff(path.stamp_ns)[is_step].sum()) * _NS
-    return seconds, float(driven_steps(path)[is_step].sum())
+    longest_ns, time_ns, metres, breaks = _longest_step_ns(path.stamp_ns), 0, 0.0, tuple(breaks)
+    for start in range(0, len(path.x) - 1, _ROWS):
+        part = rows_of(path, slice(start, start + _ROWS + 1))
+        is_step = np.ones(len(part.x) - 1, np.bool_)
+        is_step[[scan - start - 1 for scan in breaks if start < scan < start + len(part.x)]] = False
+        time_ns += int(np.diff(part.stamp_ns)[is_step].sum())
+        metres += float(_steps(part, longest_ns)[is_step].sum())
+    return time_ns * _NS, metres
 
 
 def summary_lines(

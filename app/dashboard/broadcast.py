@@ -19,6 +19,7 @@ _encode = msgspec.json.encode
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 MAP_PAUSE_S = 0.09
+_ROWS = 4096  # of a path that are encoded at once
 _EMPTY_MAP: dict[str, Any] = {"type": "map", "index": -1, "trees": []}
 
 
@@ -96,8 +97,10 @@ class Broadcast:
             start: First row of the result.
         """
         if self._path_json[:2] != (count, start):
-            rows = {"start": start, "points": np.round(path[start:], 3).tolist()}
-            self._path_json = (count, start, _encode(rows))
+            # In parts, because the lists of a long path take ten times its memory.
+            parts = (np.round(path[k : k + _ROWS], 3).tolist() for k in range(start, len(path), _ROWS))
+            points = b",".join(_encode(part)[1:-1] for part in parts)
+            self._path_json = (count, start, b'{"start":%d,"points":[%s]}' % (start, points))
         return self._path_json[2]
 
     def _next(self) -> int:

@@ -496,8 +496,8 @@ class Dashboard:
             return
         payload["layers"] |= self.scene.counts
         self._show_map(payload, path_rows)
-        scans_s = None if self.status.live else (self.path.stamp_ns - self.start_ns) / 1e9
-        if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s, scans_s):
+        stamp_ns = None if self.status.live else self.path.stamp_ns
+        if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s, stamp_ns, self.start_ns):
             self._broadcast_events()
         self.run_recorder.shown(ShownRun.of(self), self.scores.latest)
         self._score()

@@ -13,7 +13,8 @@ import numpy as np
 
 from app.sources.live_address import SILENT_S
 from pipeline.config.model import Value
-from pipeline.types.records import Float, Frame, Zone
+from pipeline.types.records import Float, Frame, Int, Zone
+from pipeline.types.units import SECOND_NS
 
 Kind = Literal[
     "tree", "warning", "change", "health", "annotation", "stop", "slow", "silence", "pause", "recording"
@@ -90,7 +91,8 @@ class Events:
         frame: Frame,
         time_s: float,
         confirmed_s: Float | None = None,
-        scans_s: Float | None = None,
+        stamp_ns: Int | None = None,
+        start_ns: int = 0,
     ) -> bool:
         """Add the events of a shown scan; return whether the list of events changed.
 
@@ -104,8 +106,9 @@ class Events:
             time_s: Time of the frame [s since the first scan].
             confirmed_s: Confirmation time of each tree of the frame, shape (T,) [s since the first scan], NaN
                 if unknown; None if all are unknown. A tree without a known time gets the event at `time_s`.
-            scans_s: Times of all scans up to the frame, shape (N,) [s since the first scan]. None in a
-                live run, where `silent` is called instead.
+            stamp_ns: Times of all scans up to the frame, shape (N,) [ns]. None in a live run, where `silent`
+                is called instead.
+            start_ns: Time of the first scan [ns].
         """
         known = dict(self._events)
         passed = {key for key, event in self._before.items() if event.time_s <= time_s}
@@ -116,8 +119,8 @@ class Events:
         for number in sorted(confirmed - self._confirmed):
             self._note(f"tree {number}", Event(at.get(number, time_s), "tree", f"Tree {number} mapped"))
         self._confirmed |= confirmed
-        if scans_s is not None:
-            self._note_silences(scans_s)
+        if stamp_ns is not None:
+            self._note_silences(stamp_ns, start_ns)
         if not time_s <= self._silent_since:
             self._note_changes(frame, time_s)
         return self._events != known or bool(passed)
@@ -151,16 +154,19 @@ class Events:
             text = f"Obstacle in the {kind} zone, {ahead_m:.2f} m ahead at its nearest"
             self._events[key] = replace(event, text=text)
 
-    def _note_silences(self, scans_s: Float) -> None:
+    def _note_silences(self, stamp_ns: Int, start_ns: int) -> None:
         """Add the silences between the scans that came since the last call. They are longer than SILENT_S,
         and than twice the lower quartile of the times between scans, because some sensors scan every few
         seconds."""
-        new = scans_s[max(self._scans - 1, 0) :]
-        self._scans = max(self._scans, len(scans_s))
-        usual_s = np.percentile(np.diff(scans_s), 25, method="lower") if len(scans_s) > 1 else 0.0
-        for k in np.flatnonzero(np.diff(new) > max(SILENT_S, 2.0 * usual_s)).tolist():
-            self.silent("No scans in the recording", float(new[k]))
-            self._turn("silence", False, float(new[k + 1]), "Data again", None)
+        new_s = (stamp_ns[max(self._scans - 1, 0) :] - start_ns) / SECOND_NS
+        self._scans = max(self._scans, len(stamp_ns))
+        gaps_s = np.diff(new_s)
+        if not (gaps_s > SILENT_S).any():
+            return
+        usual_s = np.percentile(np.diff(stamp_ns), 25, method="lower") / SECOND_NS
+        for k in np.flatnonzero(gaps_s > max(SILENT_S, 2.0 * usual_s)).tolist():
+            self.silent("No scans in the recording", float(new_s[k]))
+            self._turn("silence", False, float(new_s[k + 1]), "Data again", None)
             self._silent_since = math.nan  # a person may go back before it
 
     def silent(self, why: str, time_s: float, ago_s: float | None = None) -> bool:

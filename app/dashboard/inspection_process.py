@@ -93,7 +93,6 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     Raises:
         StemmapError: The files of the folder cannot be read or are damaged.
     """
-    import numpy as np
 
     from app.batch.run_folder import damaged_record, read_run
     from app.batch.summary import driven, lost_share
@@ -107,7 +106,6 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         lost = lost_share(record.get("health", {}).get("scans", {}))
     except (ValueError, TypeError, AttributeError, OverflowError):
         raise damaged_record(Path(question["path"])) from None
-    path_xy = np.stack([run.path.x, run.path.y], axis=1)
     trees = [{**tree, "review": run.reviews[tree["number"]]} for tree in trees_payload(run.trees, 0)]
     return {
         "uri": run.uri,
@@ -125,7 +123,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "preset": str(record.get("preset", ""))[:100],
         "parameters": run.parameters.flat(),
         "scores": _scores(record.get("evaluation")),
-        "map": {"trees": trees, "path": thinned(path_xy), "truth": None},
+        "map": {"trees": trees, "path": thinned(run.path), "truth": None},
     }
 
 

@@ -9,14 +9,13 @@ import io
 import logging
 import time
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from app.batch.run_edits import reviews_of
 from app.batch.summary import lost_share
@@ -31,8 +30,7 @@ from app.worker.protocol import Opened
 from pipeline.config.model import Value
 from pipeline.errors import StemmapError
 from pipeline.io.result_files import OPEN, REJECTED
-
-Float = NDArray[np.float64]
+from pipeline.types.records import Path
 
 _log = logging.getLogger(__name__)
 
@@ -327,7 +325,7 @@ def _figures_of(
         scores=scores,
         map={
             "trees": trees,
-            "path": thinned(np.column_stack([state.path.x, state.path.y]) + state.offset[:2]),
+            "path": thinned(state.path, state.offset),
             "truth": None if truth is None else truth["trees"],
             "offset": list(state.offset[:2]),
             "recordings": list(state.recordings),
@@ -337,12 +335,13 @@ def _figures_of(
     )
 
 
-def thinned(path_xy: Float) -> list[list[float]]:
-    """Return at most MOST_PATH_POINTS evenly spaced rows of a path, shape (N, 2) [m], with both ends, as a
-    list of [x, y] rounded to 1 mm; [] for an empty path."""
-    n = len(path_xy)
+def thinned(path: Path, offset: Sequence[float] = (0.0, 0.0)) -> list[list[float]]:
+    """Return at most MOST_PATH_POINTS evenly spaced positions of a path, with both ends, plus an offset [m]
+    as a list of [x, y] rounded to 1 mm; [] for an empty path."""
+    n = len(path.x)
     rows = np.unique(np.linspace(0, n - 1, min(n, MOST_PATH_POINTS)).round().astype(np.int64))
-    points: list[list[float]] = np.round(path_xy[rows], 3).tolist()
+    place = np.column_stack([path.x[rows], path.y[rows]]) + offset[:2]
+    points: list[list[float]] = np.round(place, 3).tolist()
     return points
 
 

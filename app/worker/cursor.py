@@ -6,15 +6,16 @@ its start, so stepping back never changes what is mapped.
 
 from __future__ import annotations
 
-from array import array
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import count, islice
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from app.sources.request import ChosenOdometry
 from pipeline.errors import SourceError
+from pipeline.geometry.columns import GrowingColumns
 from pipeline.io.block_file import BlockFile
 from pipeline.io.checkpoints import record_bytes, record_of
 from pipeline.io.readers.base import Source
@@ -55,6 +56,9 @@ class StepStore:
         self._blocks.close()
 
 
+_STAMP, _FINGERPRINT = 0, 1  # columns
+
+
 class Cursor:
     """Position in the steps of a run, before the step that `take` returns next.
 
@@ -69,7 +73,7 @@ class Cursor:
         self, read: Callable[[], Iterator[Step | None]], uri: str, store: StepStore | None = None
     ) -> None:
         self._read, self._uri, self._store = read, uri, store
-        self._stamps, self._fingerprints = array("q"), array("q")
+        self._taken = GrowingColumns(np.zeros(0, np.int64), np.zeros(0, np.int64))  # time, fingerprint
         self._next = 0
         self._ahead: Step | None = None
         self._failure: Exception | None = None
@@ -79,19 +83,20 @@ class Cursor:
     @property
     def known(self) -> int:
         """Number of steps that were taken so far."""
-        return len(self._stamps)
+        return len(self._taken)
 
     def stamp_ns(self, index: int) -> int:
         """Return the time [ns] of a step that was taken before; IndexError for an index of `known` or
         more."""
-        return self._stamps[index]
+        return int(self._taken.column(_STAMP)[index])
 
     def index_at(self, stamp_ns: int) -> int | None:
         """Return the index of the last step not later than a time [ns], or 0 if all steps are later; None if
         the time is later than the last step that was taken, or none was taken."""
-        if not self._stamps or stamp_ns > self._stamps[-1]:
+        stamps = self._taken.column(_STAMP)
+        if not self.known or stamp_ns > stamps[-1]:
             return None
-        return max(0, bisect_right(self._stamps, stamp_ns) - 1)
+        return max(0, int(np.searchsorted(stamps, stamp_ns, side="right")) - 1)
 
     def peek(self) -> Step | None:
         """Return the next step without advancing; None at the end of the run, or before a live step arrived.
@@ -115,9 +120,8 @@ class Cursor:
             return None
         self._ahead = None
         self._next += 1
-        if step.index == len(self._stamps):
-            self._stamps.append(step.scan.stamp_ns)
-            self._fingerprints.append(_fingerprint(step))
+        if step.index == self.known:
+            self._taken.write(step.index, np.array([step.scan.stamp_ns]), np.array([_fingerprint(step)]))
         return step
 
     def go_to(self, index: int) -> None:
@@ -166,7 +170,7 @@ class Cursor:
             step = next(self._steps, None)
             if step is None:
                 return None
-            if index < self.known and _fingerprint(step) != self._fingerprints[index]:
+            if index < self.known and _fingerprint(step) != self._taken.column(_FINGERPRINT)[index]:
                 raise SourceError(
                     "the source does not give the same scans again", where=self._uri, remedy="Open it again"
                 )

@@ -15,6 +15,7 @@ from functools import cache
 from typing import BinaryIO
 
 from app.common.child_process import private_streams
+from app.common.memory import return_freed_memory
 from app.common.text import COMPILING
 from app.robot.source import LiveSource
 from app.worker.loop import WorkerLoop
@@ -123,6 +124,7 @@ def _read(
 def run_as_worker(session: Session) -> None:
     """Run this process as the worker of the web process that started it, until stdin ends; does not return.
     SIGINT is ignored."""
+    return_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
     incoming, outgoing = private_streams()
     work(session, incoming, outgoing)

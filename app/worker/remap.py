@@ -28,9 +28,10 @@ from app.worker.protocol import (
 )
 from app.worker.tree_numbers import SAME
 from pipeline.config import Parameters
+from pipeline.detection.free_space import BINS
 from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
-from pipeline.geometry.columns import columns_of, rows_in_common, rows_of
+from pipeline.geometry.columns import GrowingColumns, columns_of, rows_in_common, rows_of
 from pipeline.geometry.poses import Pose2
 from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
@@ -257,8 +258,6 @@ class RunMap:
         clusters: Clusters of all scans.
         counts: Counts of all scans.
         course: Quantities of all scans, see `read_quantities`, with `time_s` [s since the first scan].
-        views: Time [ns] and view, see `SegmentedScan.view`, of the scans that `ViewSelection` takes for the
-            observed area, in the order of their times.
     """
 
     def __init__(
@@ -279,9 +278,9 @@ class RunMap:
         self.history, self.clusters, self.counts = TreeHistory(), ClusterTable(), ScanCounts()
         self.course = ScanSeries()
         self.confirmed_s: dict[int, float] = {}
-        self.views: list[tuple[int, Float]] = []
+        # Time, view and pose of the scans that `ViewSelection` takes.
+        self._views = GrowingColumns(np.zeros(0, np.int64), np.zeros((0, 2, BINS)), np.zeros((0, 3)))
         self._view_selection, self._newest_ns = ViewSelection(), -1
-        self._view_poses: list[Pose2] = []
         self._start_ns, self._time_s = start_ns, -math.inf
 
     def add(self, frame: Frame, view: Float, times: Mapping[str, float]) -> None:
@@ -302,13 +301,19 @@ class RunMap:
             self.frames.put(frame, self.mapper.path, time_s, self.confirmed(frame.trees))
         self._add_view(frame.stamp_ns, frame.estimate.T_map_base, view)
 
+    def views(self, start: int = 0) -> list[tuple[int, Float]]:
+        """Return time [ns] and view, see `SegmentedScan.view`, of the scans that `ViewSelection` takes for
+        the observed area, in the order of their times, without the first `start` ones."""
+        stamps, views, _ = (column[start:] for column in self._views.shared())
+        return list(zip(stamps.tolist(), views, strict=True))
+
     def _add_view(self, stamp_ns: int, T_map_base: Pose2, view: Float) -> None:
-        """Add the view of a scan to `views` if it is the newest one and selected."""
+        """Add the view of a scan if it is the newest one and selected."""
         if stamp_ns > self._newest_ns:
             self._newest_ns = stamp_ns
             if self._view_selection.take(T_map_base):
-                self.views.append((stamp_ns, view))
-                self._view_poses.append(T_map_base)
+                pose = T_map_base.as_array()
+                self._views.write(len(self._views), np.array([stamp_ns]), view[None], pose[None])
 
     def add_trees(self, index: int, stamp_ns: int, trees: Trees) -> float:
         """Add the trees of the scan that was mapped last, with its time [ns], as `add` does. Return the time
@@ -340,9 +345,9 @@ class RunMap:
             self.frames.close()
             self.frames = known.frames.with_trees(scans, OtherTrees(by_scan, dict(self.confirmed_s)))
         newest_ns = int(self.mapper.path.stamp_ns[-1]) if scans else -1
-        for (stamp_ns, view), pose in zip(known.views, known._view_poses, strict=True):
+        for (stamp_ns, view), pose in zip(known.views(), known._views.column(2).tolist(), strict=True):
             if stamp_ns <= newest_ns:
-                self._add_view(stamp_ns, pose, view)
+                self._add_view(stamp_ns, Pose2(*pose), view)
         self._newest_ns = newest_ns
 
     def confirmed(self, trees: Trees) -> Float:

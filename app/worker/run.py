@@ -329,7 +329,7 @@ class Run:
 
     def take_views(self) -> list[tuple[int, Float]]:
         """Return the `RunMap.views` of the present map that were not returned before."""
-        taken = self._map.views[self._views_sent :]
+        taken = self._map.views(self._views_sent)
         self._views_sent += len(taken)
         return taken
 

@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.file_arrays import empty
+
 POINT = 1.0 / 256  # m; step of a return: a standard error of 1.1 mm, that of a sensor is 10 to 30 mm
 GROUND = 1.0 / 1024  # m; step of a ground height
 
@@ -36,7 +38,7 @@ Column = NDArray[Any]
 
 
 class GrowingColumns:
-    """Columns of N rows; the capacity doubles when it is full.
+    """Columns of N rows; the capacity doubles when it is full. Large columns are in files, see `empty`.
 
     Columns that `shared` returned share their memory with later ones, but their values never change: where
     one of their rows is replaced, the columns get new memory.
@@ -74,7 +76,7 @@ class GrowingColumns:
         if start < self._rows_shared or end > capacity:
             capacity = 2 * end if end > capacity else capacity
             before, self._rows_shared = self._columns, 0
-            self._columns = [np.empty((capacity, *column.shape[1:]), column.dtype) for column in before]
+            self._columns = [empty((capacity, *column.shape[1:]), column.dtype) for column in before]
             for column, old in zip(self._columns, before, strict=True):
                 column[: len(old)] = old
         for column, new in zip(self._columns, rows, strict=True):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 import shutil
 import weakref
-from array import array
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryFile, gettempdir
+from tempfile import gettempdir
 from typing import Any, TypeVar
 
 import zstandard
+
+from pipeline.geometry.file_arrays import LARGE, unnamed_file
 
 B = TypeVar("B")
 
@@ -21,9 +22,6 @@ _LEVEL = 1  # of the compression; higher levels take longer and save one percent
 SPARE_BYTES = 2 << 30  # of the disk are left to recordings and to other programs
 BLOCKS_BETWEEN_CHECKS = 50  # of the free space of the disk
 DAMAGED = "a temporary file is damaged: {} parts are intact, the others are processed again"
-_DISK = Path("/var/tmp")  # noqa: S108 - the default may be in memory; the files have no name
-#: Folder of large temporary files; None for that of the system.
-LARGE = _DISK if _DISK.is_dir() else None
 
 
 class _File:
@@ -39,7 +37,7 @@ class _File:
 
 class BlockFile:
     """Compressed blocks of bytes by number, in a file without a name, which is deleted when it is closed.
-    Numbers begin at 0; the memory grows with the largest one.
+    Numbers begin at 0; the memory grows with the number of stored blocks.
 
     Args:
         most: Maximum size of the file [bytes]. A block that does not fit is not stored.
@@ -53,11 +51,11 @@ class BlockFile:
 
     def __init__(self, most: int = MOST_BYTES, *, drops_oldest: bool = False) -> None:
         """Create the file; an error of the disk appears in `refusal`."""
-        handle = _unnamed_file()
+        handle = unnamed_file()
         self._file = None if handle is None else _File(handle)
         self._most, self._drops_oldest = most, drops_oldest
-        # Begin (-1: not stored) and length of each block by its number: 12 bytes.
-        self._begins, self._lengths = array("q"), array("I")
+        # Begin and length of each block by its number, those that were stored first come first.
+        self._places: dict[int, tuple[int, int]] = {}
         self.refusal = self.notice = ""
         self.refused = 0
         if self._file is None:
@@ -67,18 +65,18 @@ class BlockFile:
         """Return the same blocks with an index of its own: what either stores or forgets from now on is not
         in the other one. The file is shared, and deleted when both are closed."""
         other = copy.copy(self)
-        other._begins, other._lengths = self._begins[:], self._lengths[:]
+        other._places = self._places.copy()
         if self._file is not None:
             self._file.users += 1
         return other
 
     def __len__(self) -> int:
         """Return the number of stored blocks."""
-        return sum(begin >= self._kept_from for begin in self._begins)
+        return sum(begin >= self._kept_from for begin, _ in self._places.values())
 
     def __contains__(self, index: int) -> bool:
         """Return whether a block with this number is stored."""
-        return 0 <= index < len(self._begins) and self._begins[index] >= self._kept_from
+        return self._places.get(index, (-1, 0))[0] >= self._kept_from
 
     @property
     def nbytes(self) -> int:
@@ -92,12 +90,12 @@ class BlockFile:
 
     def has_all(self, blocks: int) -> bool:
         """Return whether the blocks 0 to `blocks` - 1 are all stored."""
-        return len(self._begins) >= blocks and min(self._begins[:blocks], default=0) >= self._kept_from
+        return all(index in self for index in range(blocks))
 
     def is_new(self, index: int) -> bool:
         """Return whether a block is stored, and is among those in the newest eighth of a full file."""
         eighth = 0 if self._file is None or not self._drops_oldest else self._file.end - self._most // 8
-        return index in self and self._begins[index] >= eighth
+        return index in self and self._places[index][0] >= eighth
 
     def put_block(self, index: int, content: bytes) -> bool:
         """Store a block at the end of the file, unless its number is stored already or the file is closed. If
@@ -133,10 +131,10 @@ class BlockFile:
         except OSError as error:
             self._refuse(index, error.strerror or str(error))
             return False
-        missing = index + 1 - len(self._begins)
-        self._begins.extend([-1] * missing)
-        self._lengths.extend([0] * missing)
-        self._begins[index], self._lengths[index] = begin, len(block)
+        self._places.pop(index, None)
+        self._places[index] = begin, len(block)
+        while (first := next(iter(self._places.items())))[1][0] < file.kept_from:
+            del self._places[first[0]]
         file.end = begin + len(block)
         return True
 
@@ -163,23 +161,23 @@ class BlockFile:
         if index not in self or self._file is None:
             return None
         try:
-            self._file.handle.seek(self._begins[index] % self._most)
-            block = self._file.handle.read(self._lengths[index])
+            begin, length = self._places[index]
+            self._file.handle.seek(begin % self._most)
+            block = self._file.handle.read(length)
             if not 0 <= zstandard.frame_content_size(block) <= LARGEST:
                 raise ValueError("the size of the block is not valid")
             return unpack(zstandard.ZstdDecompressor().decompress(block))
         except (OSError, ValueError, KeyError, TypeError, RuntimeError, zstandard.ZstdError):
-            self._begins[index] = -1
+            del self._places[index]
             self.notice = DAMAGED.format(len(self))
             return None
 
     def forget_from(self, index: int) -> None:
         """Remove the blocks with this number and larger ones. The space after the last block that stays is
         used again, unless the file is shared."""
-        del self._begins[index:], self._lengths[index:]
+        self._places = {number: place for number, place in self._places.items() if number < index}
         if self._file is not None and self._file.users == 1:
-            ends = map(sum, zip(self._begins, self._lengths, strict=True))
-            self._file.end = max((self._file.kept_from, *ends))
+            self._file.end = max((self._file.kept_from, *map(sum, self._places.values())))
 
     def close(self) -> None:
         """Close the file, which is deleted unless it is shared. Later calls store and return nothing."""
@@ -199,14 +197,3 @@ def free_space(folder: Path | None) -> int:
     """Return the number of free bytes on the disk of a folder; for None or a missing folder, on the disk of
     the folder of temporary files of the system."""
     return shutil.disk_usage(folder if folder is not None and folder.is_dir() else gettempdir()).free
-
-
-def _unnamed_file() -> Any:  # noqa: ANN401 - its class depends on the operating system
-    """Return an open file without a name in LARGE, or else in the folder of temporary files of the system;
-    None if neither is possible."""
-    for place in (LARGE, None):
-        try:
-            return TemporaryFile(dir=place, buffering=0)
-        except OSError:
-            continue
-    return None

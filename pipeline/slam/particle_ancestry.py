@@ -11,12 +11,14 @@ keeps the poses of one particle only, which bounds the memory.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from pipeline.geometry.columns import GrowingColumns
+from pipeline.geometry.file_arrays import empty
 from pipeline.geometry.pose_arrays import composed, inverse
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.types.records import Float32, Int, Path
@@ -110,6 +112,21 @@ def best_after_resampling(best: int, ancestors: Int, weights: Float) -> int:
 RECENT_POSES = 300_000  # poses of all particles that are kept, so that later scans can select among them
 BLOCK = 512  # scans that are reduced to the path of one particle at once
 FOUNDED = 50  # scans between two counts of the distinct ancestors
+_BLOCKS = 64  # of one file
+_unused: list[Float] = []  # blocks of the newest file
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_unused.clear)  # a forked process shares the file
+
+
+def _stored(block: Float) -> Float:
+    """Return a copy of the poses of BLOCK scans in a file, see `file_arrays.empty`."""
+    try:
+        copy = _unused.pop()
+    except IndexError:
+        copy, *others = empty((_BLOCKS, BLOCK, 3), np.dtype(np.float64))
+        _unused.extend(others)
+    copy[:] = block
+    return copy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +150,7 @@ class EstimatedPath:
     def of(cls, poses: Float) -> EstimatedPath:
         """Return the path with the poses x, y [m], yaw [rad] of all scans, shape (N, 3), which are copied."""
         whole = len(poses) // BLOCK * BLOCK
-        blocks = tuple(poses[k : k + BLOCK].copy() for k in range(0, whole, BLOCK))
+        blocks = tuple(_stored(poses[k : k + BLOCK]) for k in range(0, whole, BLOCK))
         return cls(blocks, poses[whole:].copy())
 
     def __len__(self) -> int:
@@ -145,7 +162,7 @@ class EstimatedPath:
         newest = np.concatenate([self.newest, pose[None]])
         if len(newest) < BLOCK:
             return EstimatedPath(self.blocks, newest)
-        return EstimatedPath((*self.blocks, newest), np.zeros((0, 3)))
+        return EstimatedPath((*self.blocks, _stored(newest)), np.zeros((0, 3)))
 
     def poses(self, start: int = 0) -> Float:
         """Return the poses of the scans from `start` on as a copy, x, y [m], yaw [rad], shape (N - start,
@@ -200,7 +217,7 @@ class Genealogy:
         """Return an ancestry in which all particles have the same path, x, y [m], yaw [rad], shape (N, 3),
         and no founders. All whole blocks are settled; the poses after them are rounded to float32."""
         blocks = len(path) // BLOCK
-        settled = tuple(path[BLOCK * k : BLOCK * (k + 1)].copy() for k in range(blocks))
+        settled = tuple(_stored(path[BLOCK * k : BLOCK * (k + 1)]) for k in range(blocks))
         recent = tuple(
             Generation(np.tile(row.astype(np.float32), (particles, 1)), None)
             for row in path[BLOCK * blocks :]
@@ -229,7 +246,7 @@ class Genealogy:
             founders = _founders_after(BLOCK * len(settled) + len(recent), founders, len(pose), ancestors)
             recent.append(Generation(pose.astype(np.float32), ancestors))
             if len(recent) >= BLOCK + max(BLOCK, RECENT_POSES // len(pose)):
-                settled.append(_walk(recent, leaf)[:BLOCK])
+                settled.append(_stored(_walk(recent, leaf)[:BLOCK]))
                 del recent[:BLOCK]
         return Genealogy(tuple(settled), tuple(recent), founders)
 

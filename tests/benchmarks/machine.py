@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import resource
@@ -57,6 +58,13 @@ def resident_mib(pid: int | str = "self") -> float:
     it."""
     now = _status("VmRSS", pid)
     return peak_mib() if now is None else now
+
+
+def anonymous_mib(pid: int | str = "self") -> float:
+    """Return the resident memory of a process that is in no file [MiB]; NaN if the system does not provide
+    it."""
+    now = _status("RssAnon", pid)
+    return math.nan if now is None else now
 
 
 def _status(field: str, pid: int | str = "self") -> float | None:

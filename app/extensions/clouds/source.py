@@ -19,8 +19,8 @@ from app.sources.one_step import OneStep, OneStepSource
 from app.store.forests import kept_forests
 from app.worker.protocol import RunCounts
 from pipeline.config import Parameters
+from pipeline.geometry.file_arrays import LARGE
 from pipeline.geometry.poses import Pose3
-from pipeline.io.block_file import LARGE
 from pipeline.io.readers.base import SourceDescription
 from pipeline.types.records import Float, Float32, Frame, Sensor, Verdict
 

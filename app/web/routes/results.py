@@ -42,7 +42,7 @@ from app.worker.course import MOST_ROWS, QUANTITIES
 from app.worker.protocol import Shown
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
-from pipeline.io.block_file import LARGE
+from pipeline.geometry.file_arrays import LARGE
 
 router = APIRouter(prefix="/api")
 

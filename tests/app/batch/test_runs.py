@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from app.batch.run_folder import NO_PATH
 from app.cli.flags import source_request
 from app.common.settings import Settings
 from app.dashboard import run_recorder
@@ -30,6 +31,7 @@ from app.store.records import Author, Content
 from app.store.store import Store
 from app.worker.protocol import Begin, Open, Report, Shown, Status
 from pipeline.errors import SourceError, StemmapError
+from pipeline.types.records import Path as DrivenPath
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
@@ -421,8 +423,9 @@ async def test_a_reader_that_dies_or_hangs_is_an_error_for_people() -> None:
 
 
 def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:
-    xy = np.stack([np.arange(10_000.0), np.zeros(10_000)], axis=1)
-    thin = thinned(xy)
+    zeros = np.zeros(10_000)
+    path = DrivenPath(zeros.astype(np.int64), np.arange(10_000.0), zeros, zeros, zeros)
+    thin = thinned(path, (1.0, 2.0, 3.0))
     assert len(thin) == MOST_PATH_POINTS
-    assert (thin[0], thin[-1]) == ([0.0, 0.0], [9999.0, 0.0])
-    assert thinned(xy[:0]) == []
+    assert (thin[0], thin[-1]) == ([1.0, 2.0], [10_000.0, 2.0])
+    assert thinned(NO_PATH) == []

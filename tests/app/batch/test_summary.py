@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,26 @@ def test_two_drives_are_as_long_as_each_of_them(first, second, jump):
     both = driven(path_of([*first, jump, *second]), [len(first) + 1])
     apart = np.add(driven(path_of(first)), driven(path_of(second)))
     assert both == pytest.approx(apart, abs=1e-9)
+
+
+@given(st.lists(STEP, max_size=20), st.lists(st.integers(-1, 25), max_size=3))
+def test_the_parts_of_a_long_drive_make_the_whole(steps, breaks):
+    whole = driven(path_of(steps), breaks)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("app.batch.summary._ROWS", 3)
+        assert driven(path_of(steps), breaks) == pytest.approx(whole, abs=1e-9)
+
+
+def test_a_long_drive_is_added_up_without_copies_of_it():
+    rows = np.arange(1_000_000)
+    still = np.zeros(len(rows))
+    path = Path(rows * 10**8, np.linspace(0.0, 99_999.9, len(rows)), still, still, still)
+    tracemalloc.start()
+    try:
+        assert driven(path) == pytest.approx((99_999.9, 99_999.9))
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000  # a copy of a column has 8 MB
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_pose_that_is_set_elsewhere_is_not_driven():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +53,18 @@ async def test_only_the_newest_map_is_sent_with_all_of_the_path() -> None:
         live.show({"type": "map", "index": 6}, rewritten)
         (cut,) = await following(stream, 1)
         assert cut["path"] == {"start": 3, "points": [[9.0, 9.0]]}
+
+
+def test_a_long_path_is_encoded_in_parts() -> None:
+    path = np.arange(400_000.0).reshape(-1, 4) / 7.0
+    tracemalloc.start()
+    try:
+        text = Broadcast().path_json(1, path, 3)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert json.loads(text) == {"start": 3, "points": np.round(path[3:], 3).tolist()}
+    assert peak < 15_000_000  # its text has 4 MB, the lists of all rows 18 MB
 
 
 async def test_what_did_not_change_is_not_told_again() -> None:

@@ -118,20 +118,22 @@ def test_an_obstacle_is_logged_with_its_least_distance():
 def test_a_gap_of_a_recording_is_a_silence_at_which_a_stop_ends():
     events, stopped = Events(), replace(seen(0, 0), clearance=Clearance(Zone.STOP, ahead=0.8))
     scans = np.array([0.0, 1.0, 77.0, 77.5, 80.0])
+    stamps = (1e9 * scans).astype(np.int64)
     for until in (1, 2, 3, 4, 2, 3, 4):  # also after a person went back
-        events.shown(replace(stopped, index=until), scans[until - 1], None, scans[:until])
+        events.shown(replace(stopped, index=until), scans[until - 1], None, stamps[:until])
     silences = [(1.0, "silence", 76.0)]
     assert lasting(events) == [(0.0, "stop", 1.0), *silences, (77.0, "stop", None)]
     events.forget()
-    events.shown(stopped, 0.0, None, scans[:1])
-    events.shown(replace(seen(4, 0), clearance=Clearance(Zone.CLEAR)), 80.0, None, scans)  # a jump ahead
+    events.shown(stopped, 0.0, None, stamps[:1])
+    events.shown(replace(seen(4, 0), clearance=Clearance(Zone.CLEAR)), 80.0, None, stamps)  # a jump ahead
     assert lasting(events) == [(0.0, "stop", 1.0), *silences, (77.5, "silence", 2.5)]
 
 
 def test_a_sensor_with_a_scan_in_five_seconds_is_not_silent_between_them():
     events, scans = Events(), np.array([0.0, 5.0, 10.0, 15.0, 60.0, 65.0])
+    stamps = (1e9 * scans).astype(np.int64)
     for until in range(1, 7):
-        events.shown(seen(until, 0), scans[until - 1], None, scans[:until])
+        events.shown(seen(until, 0), scans[until - 1], None, stamps[:until])
     assert lasting(events) == [(15.0, "silence", 45.0)]
 
 

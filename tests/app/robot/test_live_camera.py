@@ -196,7 +196,7 @@ def test_a_full_disk_costs_pictures_and_nothing_else(monkeypatch: pytest.MonkeyP
     def full(**_how: Any) -> Any:
         return Path("/dev/full").open("w+b", buffering=0)
 
-    monkeypatch.setattr("pipeline.io.block_file.TemporaryFile", full)
+    monkeypatch.setattr("pipeline.geometry.file_arrays.TemporaryFile", full)
     with closing(PictureStore()) as kept:
         kept.add(Picture(1, "", 0, 0, 0, bytes(10)), way([1]))
         assert list(kept.losses) == ["pictures not stored for trees: No space left on device"]

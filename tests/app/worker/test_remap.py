@@ -397,7 +397,7 @@ def results(session: Session, scans: int) -> list[object]:
         course.time_s,
         known.counts.totals(scans - 1, [], {}),
         clusters.places(path[: len(clusters)], BASE),
-        known.views,
+        known.views(),
         known.history._rows.column(0),
         known.confirmed_s,
         sorted(known.snapshots._files),

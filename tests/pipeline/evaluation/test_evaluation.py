@@ -116,6 +116,13 @@ def test_what_is_beyond_the_reach_is_counted():
     assert evaluate(trees(found), truth, FOREST).beyond == 0
 
 
+def test_trees_at_all_parts_of_a_long_path_count():
+    path = np.column_stack([np.linspace(0.0, 4000.0, 40_000), np.zeros(40_000)])
+    position = np.array([[0.0, 1.0], [1638.4, 5.0], [4000.0, 2.0], [2000.0, 500.0]])
+    score = evaluate(trees(position), truth_trees(position, ("tree",) * 4), FOREST, path)
+    assert (score.TA.of, score.beyond) == (3, 1)
+
+
 @pytest.mark.parametrize(
     ("factor", "told"),
     [

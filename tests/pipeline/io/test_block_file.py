@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from contextlib import closing
 
 import numpy as np
@@ -49,6 +50,20 @@ def test_the_space_of_forgotten_blocks_is_used_again_once_the_file_is_not_shared
         other.close()
         file.forget_from(1)
         assert file.nbytes == size // 2
+
+
+def test_dropped_blocks_take_no_memory() -> None:
+    with closing(BlockFile(4000, drops_oldest=True)) as file:
+        for number in range(2000):
+            assert file.put_block(number, bytes(10))
+        tracemalloc.start()
+        try:
+            for number in range(2000, 12_000):
+                assert file.put_block(number, bytes(10))
+            grown = tracemalloc.get_traced_memory()[0]
+        finally:
+            tracemalloc.stop()
+    assert grown < 60_000  # of the 200 blocks of the file
 
 
 @given(

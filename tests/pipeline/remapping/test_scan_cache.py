@@ -96,7 +96,7 @@ def test_each_set_of_segmentation_parameters_has_its_cache_and_the_last_few_are_
 
 def test_damaged_scans_are_processed_again_and_a_notice_says_so(cache):
     fill(cache, BASE, run()[0][:SCANS])
-    at, length = cache._begins[5], cache._lengths[5]
+    at, length = cache._places[5]
     cache._file.handle.seek(at + length // 2)
     cache._file.handle.write(b"damage")
     read: list[int] = []
@@ -153,7 +153,7 @@ def test_without_a_folder_to_write_to_nothing_is_stored_and_that_is_said(monkeyp
     def refused(**_: object) -> None:
         raise PermissionError
 
-    monkeypatch.setattr("pipeline.io.block_file.TemporaryFile", refused)
+    monkeypatch.setattr("pipeline.geometry.file_arrays.TemporaryFile", refused)
     with closing(ScanCaches()) as caches:
         assert len(fill(caches.of(BASE), BASE, run()[0][:2])) == 0
         assert "no folder can be written to" in caches.of(BASE).refusal

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -51,6 +53,22 @@ def test_a_long_past_is_settled_and_stays():
     assert len(genealogy.recent) < 2 * BLOCK
     assert len(genealogy) == 2 * BLOCK + 10
     np.testing.assert_array_equal(genealogy.path(3)[:, 0], np.arange(2 * BLOCK + 10))
+
+
+def test_a_settled_past_takes_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.slam.particle_ancestry.RECENT_POSES", BLOCK)
+    pose, path, past, known = np.zeros((1, 3)), EstimatedPath(), Genealogy(), list[int]()
+    tracemalloc.start()
+    try:
+        for _ in range(40):
+            past = past.with_scans([(pose, None, 0)] * BLOCK)
+            for _ in range(BLOCK):
+                path = path.with_pose(pose[0])
+            known.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert len(past.settled) == 39
+    assert known[-1] - known[-2] < 4096  # of 25 kB
 
 
 def test_nothing_has_no_path():

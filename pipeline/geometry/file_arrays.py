@@ -1,0 +1,47 @@
+"""Arrays that grow with the length of a drive, in temporary files: their pages are no memory of the process
+that the system could not take back."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import os
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_DISK = Path("/var/tmp")  # noqa: S108 - the default may be in memory; the files have no name
+#: Folder of large temporary files; None for that of the system.
+LARGE = _DISK if _DISK.is_dir() else None
+LEAST = 1 << 16  # bytes; smaller arrays are in memory
+
+
+def unnamed_file() -> Any:  # noqa: ANN401 - its class depends on the operating system
+    """Return an open file without a name in LARGE, or else in the folder of temporary files of the system;
+    None if neither is possible."""
+    for place in (LARGE, None):
+        try:
+            return TemporaryFile(dir=place, buffering=0)
+        except OSError:
+            continue
+    return None
+
+
+def empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return an array like `np.empty`. From LEAST bytes on it is in a file without a name, which is deleted
+    with the array, if the disk has room for all of it. A forked process shares its values."""
+    size = math.prod(shape) * dtype.itemsize
+    reserve = getattr(os, "posix_fallocate", None)  # else a full disk would end the process
+    file = unnamed_file() if size >= LEAST and reserve is not None else None
+    if reserve is None or file is None:
+        return np.empty(shape, dtype)
+    with file:
+        try:
+            reserve(file.fileno(), 0, size)
+            pages = mmap.mmap(file.fileno(), size)
+        except OSError:
+            return np.empty(shape, dtype)
+    return np.frombuffer(pages, dtype).reshape(shape)
