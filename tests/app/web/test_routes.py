@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from app.common.settings import Files, Settings
+from app.common.timers import RequestQueue
 from app.dashboard.dashboard import Dashboard
 from app.sources import opening
 from app.sources.one_step import OneStep
@@ -652,6 +653,7 @@ async def test_viewers_wait_for_one_another_and_a_long_queue_is_refused(both: Ru
     client, dashboard = both
     await show(dashboard)
     viewer = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
+    dashboard_app(both).state.limits.viewers = RequestQueue(0.05)
     answers = await asyncio.gather(*(client.get("/api/pairs", headers=viewer) for _ in range(12)))
     statuses = [answer.status_code for answer in answers]
     assert set(statuses) == {200, 429}
