@@ -85,38 +85,36 @@ def test_every_preset_is_within_the_bounds_and_has_a_source(name):
     assert "  " not in PRESETS[name][0]
 
 
-@pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)
-def test_every_parameter_has_title_unit_and_explanation(spec):
-    assert spec.title
-    assert spec.title[0].isupper() or spec.title[0] in "xyz"
-    assert spec.doc.endswith(".")
-    assert len(spec.doc) > 20
-    assert "|" not in spec.doc + spec.title, "it would break the table in README"
-    assert spec.unit in UNITS
-    assert spec.stage
+def test_every_parameter_has_title_unit_and_explanation():
+    for spec in SPECS:
+        assert spec.title[0].isupper() or spec.title[0] in "xyz", spec.name
+        assert spec.doc.endswith("."), spec.name
+        assert len(spec.doc) > 20, spec.name
+        assert "|" not in spec.doc + spec.title, f"{spec.name}: it would break the table in README"
+        assert spec.unit in UNITS, spec.name
+        assert spec.stage, spec.name
 
 
-@pytest.mark.parametrize("spec", NUMBERS, ids=lambda s: s.name)
-def test_every_number_has_bounds_a_step_and_a_default_between(spec):
-    assert spec.minimum < spec.maximum
-    assert 0 < spec.step <= spec.maximum - spec.minimum
-    assert spec.minimum <= spec.default <= spec.maximum
-    assert spec.kind == "float" or spec.step == 1
+def test_every_number_has_bounds_a_step_and_a_default_between():
+    for spec in NUMBERS:
+        assert 0 < spec.step <= spec.maximum - spec.minimum, spec.name
+        assert spec.minimum <= spec.default <= spec.maximum, spec.name
+        assert spec.kind == "float" or spec.step == 1, spec.name
 
 
-@pytest.mark.parametrize("spec", NUMBERS, ids=lambda s: s.name)
-def test_bounds_are_inclusive(spec):
-    number = int if spec.kind == "int" else float
-    beyond = 1 if spec.kind == "int" else 1e-6
-    for value in (number(spec.minimum - beyond), number(spec.maximum + beyond)):
-        with pytest.raises(ParameterError, match=spec.name.replace(".", r"\.")):
-            preset("forest").replace({spec.name: value})
-    for bound in (spec.minimum, spec.maximum):
-        told = replaced(spec.name, number(bound))
-        if isinstance(told, str):  # the other end of a pair stands in its way, and is named
-            assert "must be less than" in told
-        else:
-            assert told.flat()[spec.name] == bound
+def test_bounds_are_inclusive():
+    for spec in NUMBERS:
+        number = int if spec.kind == "int" else float
+        beyond = 1 if spec.kind == "int" else 1e-6
+        for value in (number(spec.minimum - beyond), number(spec.maximum + beyond)):
+            with pytest.raises(ParameterError, match=spec.name.replace(".", r"\.")):
+                preset("forest").replace({spec.name: value})
+        for bound in (spec.minimum, spec.maximum):
+            told = replaced(spec.name, number(bound))
+            if isinstance(told, str):  # the other end of a pair stands in its way, and is named
+                assert "must be less than" in told, spec.name
+            else:
+                assert told.flat()[spec.name] == bound
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), True, "0.3"])
