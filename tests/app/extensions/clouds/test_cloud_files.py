@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import struct
 import sys
 import zipfile
@@ -19,7 +18,7 @@ from hypothesis.extra import numpy as arrays
 from app.cli import main
 from app.extensions.clouds.point_cloud import offset_for, open_cloud
 from pipeline.errors import SourceError
-from pipeline.io.readers import is_cloud, open_source
+from pipeline.io.readers import is_cloud
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
 from tests.pipeline.plots import plot, write_las
 
@@ -259,19 +258,6 @@ def test_damaged_files_never_crash(tmp_path, points):
                 assert sum(len(part) for part in open_cloud(str(tmp_path / name)).parts()) <= 2000
             with suppress(ScanFileError):
                 read_columns(open_table(tmp_path / name), {})
-
-
-def test_a_cloud_is_mapped_driven_through_and_told_of_like_a_las_file(tmp_path, points, capsys):
-    file = write(tmp_path / "plot.ply", points)
-    out = tmp_path / "out"
-    assert main(["map", str(file), "--out", str(out)]) == 0
-    assert json.loads((out / "run.json").read_text())["trees"] == 9
-    capsys.readouterr()
-    assert main(["info", str(file)]) == 0
-    assert "whole cloud, PLY binary" in capsys.readouterr().out
-    opened, named = open_source(str(file)), open_source(f"sim:cloud?file={file}")
-    assert opened.description.digest == named.description.digest
-    assert opened.description.kind == "simulated drive through a whole cloud (PLY binary)"
 
 
 @given(
