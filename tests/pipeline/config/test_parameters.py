@@ -23,7 +23,7 @@ from pipeline.config.model import toml_table, value_text
 from pipeline.errors import ParameterError
 
 SPECS = field_specs()
-NUMBERS = [spec for spec in SPECS if spec.kind in ("float", "int")]
+NUMBERS: list[Any] = [spec for spec in SPECS if spec.kind in ("float", "int")]
 UNITS = {"", "m", "s", "m/m", "m/s", "m/s²", "m/√m", "deg", "deg/√m", "deg/√rad", "sigma", "m²"}
 
 
