@@ -85,7 +85,12 @@ async def test_commands_reach_the_worker(both: Running, body: dict[str, Any], co
         (b'{"type": "explode"}', "explode"),
         (b'{"type": "open", "uri": "/etc/passwd"}', "open"),
         (b'{"type": "seek", "time_s": NaN}', "does not fit"),
+        (b'{"type": "seek", "time_s": -1}', "time_s"),
+        (b'{"type": "seek", "time_s": 1e10}', "time_s"),
         (b'{"type": "set_speed", "factor": -1}', "factor"),
+        (b'{"type": "set_speed", "factor": 1e-300}', "factor"),
+        (b'{"type": "set_speed", "factor": 1e9}', "factor"),
+        (b'{"type": "advance", "scans": -1000000001}', "scans"),
         (b"[" * 5000, "parsing the body"),
     ],
 )
