@@ -28,7 +28,6 @@ _LONGEST = (
     "app/worker/test_remap.py",
     "app/extensions/maps/test_localise.py",
     "app/worker/test_supervisor.py",
-    "app/extensions/cluster/test_dask.py",
 )
 
 # No deadline, because a kernel compiles at its first call. The default profile draws the same few examples at
@@ -52,6 +51,8 @@ if sys.dont_write_bytecode:
     sys.dont_write_bytecode = False
     sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(ROOT / ".pytest_cache" / "bytecode")
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+gc.disable()  # until all is imported and collected, see below
 
 # Two test processes share the cores, so each library computes in one thread.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -107,6 +108,7 @@ def pytest_collection_finish() -> None:
     """Leave what is imported and collected out of the searches for garbage, an eighth of the time."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 def pytest_sessionfinish() -> None:

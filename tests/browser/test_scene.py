@@ -12,16 +12,11 @@ import pytest
 from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
-from tests.browser.test_accessibility import violations
 
 pytestmark = pytest.mark.usefixtures("calm")
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "static" / "js"
 MARKERS = "/world/robot/scan/markers"
-SEEN = """name => {
-  const node = window.__viserSceneTree?.getState()[name];
-  return Boolean(node) && node.visibility !== false;
-}"""
 
 
 def test_the_scene_shows_the_run_without_errors(dashboard: Dashboard):
@@ -70,28 +65,6 @@ def test_the_eps_slider_changes_the_clusters_of_the_current_scan(dashboard: Dash
     dashboard.tab("Tune")
     expect(eps).to_have_value("0.4")
     dashboard.tab("Trees")
-
-
-def test_the_eps_slider_moves_by_the_keyboard(dashboard: Dashboard):
-    slider = dashboard.row("Radius eps").get_by_role("slider")
-    slider.press("ArrowRight")
-    dashboard.until_server("/api/parameters", "Math.abs(it.values['clustering.eps'] - 0.16) < 1e-9")
-    slider.press("ArrowLeft")
-    dashboard.until_server("/api/parameters", "it.changed.length === 0")
-    assert dashboard.state == "paused"  # the arrow moved the slider, and not the run
-
-
-def test_a_contradictory_value_is_reverted_with_the_reason(dashboard: Dashboard):
-    set_maximum = dashboard.row("Maximum eccentricity").locator("input[type=text]")
-    set_maximum.fill("20")
-    set_maximum.press("Tab")
-    dashboard.until_server("/api/parameters", "it.values['detection.e_max'] === 20")
-    box = dashboard.row("Minimum eccentricity").locator("input[type=text]")
-    box.fill("25")
-    box.press("Tab")
-    expect(dashboard.scene.get_by_text("must be less than")).to_be_visible()
-    expect(box).to_have_value("1")
-    assert dashboard.ask("/api/parameters")["changed"] == ["detection.e_max"]
 
 
 # Of each slider of the scene: its label, and its thumb and the ends of its track in pixels of the page.
@@ -195,15 +168,6 @@ def test_both_panels_have_the_same_parameters_in_the_same_order_and_undo_works_f
         dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 0.15")
 
 
-def test_points_have_a_bounded_size_and_the_view_an_angle_of_45_degrees(dashboard: Dashboard):
-    dashboard.scene.wait_for_function(
-        """() => { const all = [];
-        window.__viserMutable.scene.traverse(node => node.isPoints && all.push(node.material.vertexShader));
-        return all.length > 0 && all.every(text => text.includes("clamp(scale")); }"""
-    )
-    assert dashboard.scene.evaluate("() => window.__viserMutable.camera.fov") == pytest.approx(45.0, abs=0.1)
-
-
 def test_one_file_uses_private_objects_of_the_client_of_viser():
     private = re.compile(r"__viser|nodeRefFromName|cameraControl|uLabelData|setColorAt|vertexShader")
     used = [path.name for path in SCRIPTS.rglob("*.js") if private.search(path.read_text())]
@@ -222,19 +186,6 @@ def test_the_client_of_viser_has_the_private_parts_that_one_file_uses(dashboard:
     }"""
     )
     assert missing == []
-
-
-def test_a_preset_is_chosen_in_the_scene(dashboard: Dashboard):
-    def choose(name: str) -> None:
-        dashboard.scene.get_by_role("combobox").first.click()
-        dashboard.scene.get_by_role("option", name=name, exact=True).click()
-        dashboard.until_server("/api/parameters", f"it.preset === '{name}'")
-        expect(dashboard.page.locator("#preset")).to_have_text(name)
-
-    choose("paper")
-    assert dashboard.ask("/api/parameters")["values"]["clustering.eps"] == 0.25
-    expect(dashboard.row("Radius eps").locator("input[type=text]")).to_have_value("0.25")
-    choose("forest")
 
 
 SELECTION_IS_PAINTED = """() => {
@@ -331,16 +282,6 @@ def test_keys_work_on_the_page_and_in_the_scene(dashboard: Dashboard):
     expect(page.get_by_role("heading", name="Settings and keyboard shortcuts")).to_be_visible()
 
 
-def test_a_key_of_the_page_switches_following(dashboard: Dashboard):
-    scene = dashboard.scene
-    follow = dashboard.page.locator("#follow")
-    expect(follow).to_have_attribute("aria-pressed", "true")
-    dashboard.page.locator("#map").press("f")
-    expect(follow).to_have_attribute("aria-pressed", "false")
-    scene.locator("canvas").first.press("f")
-    expect(follow).to_have_attribute("aria-pressed", "true")
-
-
 def test_a_layer_is_switched_off(dashboard: Dashboard):
     scene = dashboard.scene
     page = dashboard.page
@@ -365,33 +306,6 @@ def test_a_layer_is_switched_off(dashboard: Dashboard):
     scene.wait_for_function(hidden, arg="/world/robot/scan/raw")
     page.locator("#map").press(key)
     scene.wait_for_function(f"name => !({hidden})(name)", arg="/world/robot/scan/raw")
-
-
-def test_accumulated_map_voxels_and_errors_are_layers(dashboard: Dashboard):
-    page = dashboard.page
-    page.get_by_role("button", name="Layers").click()
-    rows = page.locator("#layer-list label:has(input)")
-    titles = rows.locator("span:not(.count)").all_inner_texts()
-    assert {
-        "Raw scan",
-        "Filtered",
-        "Voxels",
-        "Clusters",
-        "Fitted circles",
-        "Ground",
-        "Accumulated map",
-    } <= set(titles)
-    assert {"Particles", "Path", "Trees", "Ground truth", "Errors (10 times as long)"} <= set(titles)
-    for layer, node in (("gathered", "/world/gathered/0"), ("voxels", "/world/robot/scan/voxels")):
-        page.locator(f"[data-layer={layer}]").check()
-        dashboard.scene.wait_for_function(SEEN, arg=node)
-        expect(page.locator(f"label:has([data-layer={layer}]) .count")).not_to_have_text("0")
-    page.locator("[data-layer=errors]").check()
-    dashboard.scene.wait_for_function(SEEN, arg="/world/errors")
-    for layer in ("gathered", "voxels", "errors"):
-        page.locator(f"[data-layer={layer}]").uncheck()
-    dashboard.scene.wait_for_function(f"name => !({SEEN})(name)", arg="/world/errors")
-    page.get_by_role("button", name="Layers").click()
 
 
 APART = 25  # [px] between markers, so that a click does not hit its neighbour
@@ -534,15 +448,6 @@ def test_labels_do_not_cover_one_another_wherever_the_camera_is(dashboard: Dashb
     assert hidden > 0
 
 
-# Rules of axe-core that elements of viser's client break.
-VISER = {"button-name", "landmark-one-main", "page-has-heading-one", "region"}
-
-
-def test_what_axe_says_of_the_frame_of_viser(dashboard: Dashboard):
-    """The elements are those of viser's client; the list tells when that changes."""
-    assert {each.split(":")[0] for each in violations(dashboard.scene)} <= VISER
-
-
 def test_the_theme_is_stored(dashboard: Dashboard):
     page = dashboard.page
     dashboard.scene.evaluate("() => { window.isTheSame = true; }")
@@ -562,61 +467,3 @@ GROUND = """() => {
   while (node && !node.style.backgroundColor) node = node.parentElement;
   return getComputedStyle(node).backgroundColor;
 }"""
-
-
-# How many trees of the scene are grey, and how many there are.
-GREYED = """() => {
-  let mesh = null;
-  const node = window.__viserMutable.nodeRefFromName['/world/trees'];
-  node.traverse(each => { if (each.getColorAt) mesh ??= each; });
-  const isGrey = (k) => { const { r, g, b } = mesh.getColorAt(k); return r === g && g === b; };
-  const all = Array.from({ length: mesh.instancesCount }, (_, k) => isGrey(k));
-  return [all.filter(Boolean).length, all.length];
-}"""
-
-
-@pytest.mark.usefixtures("calm")
-def test_the_scene_greys_the_trees_that_the_filter_leaves_out(dashboard: Dashboard):
-    dashboard.load_scene()
-    dashboard.tab("Trees")
-    measured = sum(row["dbh_cm"] is not None for row in trees_of(dashboard))
-    greyed = lambda: dashboard.scene.evaluate(GREYED)  # noqa: E731
-    assert greyed()[0] == 0
-    dashboard.page.locator("#find").fill("dbh > 30")
-    count = dashboard.page.locator("#trees tbody tr").count
-    dashboard.eventually(lambda: greyed()[0] == greyed()[1] - count() and 0 < count() < measured, greyed)
-    dashboard.page.locator("#find").fill("")
-    dashboard.eventually(lambda: greyed()[0] == 0, greyed)
-
-
-def trees_of(dashboard: Dashboard) -> list[dict[str, float | None]]:
-    """The trees of the map that the page shows."""
-    read = "async () => (await import('/static/js/core/store.js')).trees()"
-    return list(dashboard.page.evaluate(read))
-
-
-def test_the_notice_of_software_rendering_closes_by_itself(dashboard: Dashboard):
-    """It covers a part of the scene; a browser that showed it before closes it at once."""
-    scene = dashboard.scene
-    shown = "() => localStorage.getItem('stemmap.rendering-notice')"
-    if dashboard.page.evaluate(shown) is None:
-        pytest.skip("this browser renders in hardware")
-    scene.wait_for_function(
-        "() => ![...document.querySelectorAll('[class*=mantine-Notification-root]')]"
-        ".some(({ textContent }) => textContent.includes('Software WebGL'))"
-    )
-
-
-def test_the_panel_leaves_a_small_scene_free(wide: Dashboard):
-    page, scene = wide.page, wide.scene
-    slider = scene.get_by_role("slider", name="Radius eps").first
-    expect(slider).to_be_visible()
-    split = page.locator("#split-left")
-    split.focus()
-    for _ in range(60):
-        if page.locator("#scene").evaluate("node => node.clientWidth") < 540:
-            break
-        split.press("ArrowLeft")
-    expect(slider).to_be_hidden()
-    split.dblclick()
-    expect(slider).to_be_visible()

@@ -51,17 +51,6 @@ def test_a_value_is_typed_marked_undone_and_reset(dashboard: Dashboard):
     expect(row.get_by_role("button", name="Reset Radius eps")).to_be_hidden()
 
 
-def test_a_slider_moves_by_its_step_and_to_its_end(dashboard: Dashboard):
-    page = dashboard.page
-    slider = page.get_by_role("slider", name="Radius eps, slider")
-    slider.press("ArrowRight")
-    dashboard.until_server("/api/parameters", "Math.abs(it.values['clustering.eps'] - 0.16) < 1e-9")
-    slider.evaluate("node => { node.value = 1000; node.dispatchEvent(new Event('input', {bubbles: true})); }")
-    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 1")
-    expect(value(page, "clustering.eps")).to_have_value("1")
-    assert dashboard.state == "paused"
-
-
 def test_a_refused_value_stays_with_the_reason_below_it_until_another_is_accepted(dashboard: Dashboard):
     page = dashboard.page
     lowest = value(page, "detection.e_min")
@@ -193,21 +182,3 @@ def test_sliders_are_in_view_and_none_moves_while_one_is_dragged(
     lowest.press("Escape")
     dashboard.errors.clear()
     page.set_viewport_size(before)
-
-
-def test_a_change_that_does_not_alter_the_map_is_said(dashboard: Dashboard):
-    field = value(dashboard.page, "filters.z_max")
-    field.fill("19.95")
-    field.press("Enter")
-    expect(dashboard.page.locator("#tune-whole-status")).to_contain_text("the same as before")
-
-
-def test_a_limit_in_a_story_leads_to_its_slider(dashboard: Dashboard):
-    page = dashboard.page
-    dashboard.tab("Clusters")
-    page.locator("#panel-clusters tbody tr").first.click()
-    limit = page.locator("#panel-story .checks button").first
-    title = (limit.get_attribute("title") or "").removeprefix("Go to the slider of ")
-    limit.click()
-    row = page.locator(".tune-row:focus-within label")
-    expect(row).to_contain_text(title)

@@ -7,9 +7,6 @@ import pytest
 
 from app.extensions.learning.examples import TREE, UNKNOWN
 from pipeline.config import preset
-from pipeline.simulation.lidar import CONE
-from pipeline.simulation.scene_objects import SceneBuilder, add_sign
-from pipeline.simulation.terrain import SimulatedTerrain
 from tests.benchmarks.package_forest.labelled_scenes import street_examples
 from tests.benchmarks.package_forest.street_scenes import simulate_street
 
@@ -34,14 +31,6 @@ def test_every_return_has_a_label(street):
     assert scene.returns.sum() == np.count_nonzero(scene.kind == "trunk")
 
 
-def test_a_sensor_that_looks_one_way_sees_a_cone(street):
-    one_way, scene = street
-    points = scene.steps[0].scan.points
-    ahead = points[:, 0] / np.linalg.norm(points, axis=1)
-    assert (scene.sensor.rings == 0) == one_way
-    assert bool((ahead >= np.cos(CONE) - 1e-6).all()) == one_way
-
-
 def test_trunks_stand_where_their_returns_are():
     scene = simulate_street(204, one_way=False)
     sure = scene.trunk[scene.returns >= 30]
@@ -49,15 +38,6 @@ def test_trunks_stand_where_their_returns_are():
     assert len(sure)
     for place in sure:
         assert np.count_nonzero(np.hypot(*(returns - place).T) < 1.5) >= 30
-
-
-def test_a_sign_is_a_pole_and_its_plate():
-    scene = SceneBuilder(SimulatedTerrain(np.zeros((1, 4))), np.random.default_rng(1))
-    add_sign(scene, 3.0, 1.0)
-    solids = scene.solids.build()
-    assert scene.kinds[solids.owner[0]] == "pole"
-    assert len(solids.kind) >= 2
-    assert not scene.truth
 
 
 def test_examples_of_a_street_know_trees_and_other_things():

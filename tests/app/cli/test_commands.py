@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import py_compile
-import re
 import shutil
 import signal
 import subprocess
@@ -20,10 +19,9 @@ import pytest
 from app.cli import COMMANDS, _check_command, flags, main
 from app.cli import map as map_command
 from app.common.text import COMPILING
-from pipeline.config import PRESETS, field_specs, from_toml, preset
+from pipeline.config import field_specs, from_toml, preset
 from pipeline.jit import on_compiling, others_compile
 from pipeline.odometry.lidar_odometry import LOST
-from pipeline.simulation.scenarios import SCENARIOS
 from pipeline.types.records import Notice, Scan
 
 RUN = "sim:paper?duration=2"
@@ -49,11 +47,6 @@ def stemmap(capsys: pytest.CaptureFixture[str], *words: object) -> Told:
     code = main([str(word) for word in words])
     told = capsys.readouterr()
     return Told(code, told.out, told.err)
-
-
-def test_the_help_of_simulate_names_every_scenario(capsys):
-    words = re.findall(r"\w+", stemmap(capsys, "simulate", "--help").out)
-    assert not [name for name in SCENARIOS if name not in words]
 
 
 def test_an_option_that_is_mistyped_is_named(capsys):
@@ -150,12 +143,6 @@ def test_a_request_to_stop_before_the_command_runs_is_told_in_a_line(capsys, mon
 # --- help -----------------------------------------------------------------------------------------
 
 
-def test_help_names_every_command(capsys):
-    told = stemmap(capsys, "--help")
-    assert told.code == 0
-    assert all(re.search(rf"\n    {name}\s", told.out) for name in COMMANDS)
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_each_command_has_help_that_a_person_can_follow(capsys, name):
     told = stemmap(capsys, name, "--help")
@@ -173,20 +160,7 @@ def test_the_version_is_that_of_the_distribution(capsys):
 
 @pytest.mark.parametrize(
     "words",
-    [
-        ["map"],
-        ["map", RUN],
-        ["map", RUN, "--out"],
-        ["map", RUN, "--out", "x", "--speed", "3"],
-        ["map", RUN, "--out", "x", "--seed", "-1"],
-        ["map", RUN, "--out", "x", "--seed", "1.5"],
-        ["map", RUN, "--out", "x", "--odometry", "legs"],
-        ["params", "--format", "xml"],
-        ["evaluate"],
-        ["--nothing"],
-        ["serve", "--port", "70000"],
-        ["serve", "--port", "-1"],
-    ],
+    [["map", RUN], ["map", RUN, "--out", "x", "--seed", "-1"], ["evaluate"], ["serve", "--port", "70000"]],
     ids=" ".join,
 )
 def test_wrong_words_are_wrong_usage(capsys, words):
@@ -194,13 +168,6 @@ def test_wrong_words_are_wrong_usage(capsys, words):
 
 
 # --- parameters -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_as_toml_is_that_preset(capsys, name):
-    told = stemmap(capsys, "params", "--preset", name, "--format", "toml")
-    assert told.code == 0
-    assert from_toml(told.out, preset("forest"), "x") == preset(name)
 
 
 def test_a_file_of_parameters_goes_in_as_it_came_out(capsys, tmp_path):
@@ -220,44 +187,19 @@ def test_the_table_names_every_parameter_with_its_value(capsys):
         assert spec.doc in told.out
 
 
-def test_markdown_has_a_column_a_preset(capsys):
-    lines = stemmap(capsys, "params", "--format", "markdown").out.splitlines()
-    head = next(line for line in lines if line.startswith("|"))
-    assert all(f"`{name}`" in head for name in PRESETS)
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [
         (["--set", "clustering.eps=9"], ["clustering.eps = 9", "less than or equal to 5"]),
-        (["--set", "clustering.eps=0"], ["clustering.eps = 0", "greater than or equal to 0.01"]),
-        (["--set", "clustering.eps=nan"], ["finite"]),
-        (["--set", "clustering.eps=wide"], ["'wide'", "number"]),
-        (["--set", "clustering.epz=1"], ["clustering.epz", "clustering.eps"]),
-        (["--set", "clustering.eps"], ["stage.name=value"]),
-        (["--set", "filters.x_min=5", "--set", "filters.x_max=5"], ["filters.x_min", "filters.x_max"]),
         (["--preset", "wood"], ["wood", "forest"]),
         (["--config", "none.toml"], ["none.toml"]),
     ],
     ids=str,
 )
-@pytest.mark.parametrize("command", ["params", "map"])
-def test_a_parameter_that_does_not_fit_is_wrong_usage(capsys, tmp_path, monkeypatch, command, words, says):
+def test_a_parameter_that_does_not_fit_is_wrong_usage(capsys, tmp_path, monkeypatch, words, says):
     monkeypatch.chdir(tmp_path)
-    first = ["map", RUN, "--out", tmp_path / "out"] if command == "map" else ["params"]
-    stemmap(capsys, *first, *words).refused(2, *says)
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "out", *words).refused(2, *says)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("content", [b"", b"[clustering]\neps = 99\n", b"\xff\xfe", b"eps = 1", b"[[["])
-def test_a_file_of_parameters_that_does_not_fit_is_named(capsys, tmp_path, content):
-    file = tmp_path / "mine.toml"
-    file.write_bytes(content)
-    told = stemmap(capsys, "params", "--config", file)
-    if content == b"":
-        assert told.code == 0
-    else:
-        told.refused(2, "mine.toml")
 
 
 # --- sources --------------------------------------------------------------------------------------
@@ -268,10 +210,8 @@ def test_a_file_of_parameters_that_does_not_fit_is_named(capsys, tmp_path, conte
     [
         ("sim:wood", 2, "sim:stand"),
         ("sim:paper?speed=3", 2, "speed"),
-        ("sim:paper?duration=x", 2, "duration"),
         ("none.mcap", 1, "no such file"),
         ("ftp://host/x", 2, "ftp"),
-        ("x\0y", 1, "no such file"),
     ],
 )
 def test_a_source_that_is_none_fails_in_one_line(capsys, tmp_path, monkeypatch, source, code, says):
@@ -280,7 +220,7 @@ def test_a_source_that_is_none_fails_in_one_line(capsys, tmp_path, monkeypatch, 
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a.pcap", "a.zip", "a.db3", "a.bin", "a"])
+@pytest.mark.parametrize("name", ["a.mcap", "a"])
 @pytest.mark.parametrize("content", [b"", b"\0" * 5000, b"hello world\n" * 99])
 def test_a_file_that_is_no_recording_fails_in_one_line(capsys, tmp_path, name, content):
     file = tmp_path / name
@@ -306,7 +246,7 @@ def test_a_folder_that_cannot_be_made_fails_in_one_line(capsys, tmp_path):
     stemmap(capsys, "map", RUN, "--out", tmp_path / "file" / "below").refused(1, "cannot read or write")
 
 
-@pytest.mark.parametrize(("word", "meant"), [("mpa", "map"), ("maps", "map"), ("evalute", "evaluate")])
+@pytest.mark.parametrize(("word", "meant"), [("mpa", "map")])
 def test_a_mistyped_command_is_named(capsys, tmp_path, monkeypatch, word, meant):
     monkeypatch.chdir(tmp_path)
     stemmap(capsys, word, RUN, "--out", "out").refused(2, f"no command '{word}'", f"`stemmap {meant}`")
@@ -386,24 +326,6 @@ def test_another_seed_gives_other_bytes(mapped, tmp_path, capsys):
     assert (mapped / "path.csv").read_bytes() != (tmp_path / "path.csv").read_bytes()
 
 
-def test_a_mapping_says_what_came_of_it(tmp_path, capsys):
-    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out")
-    assert told.code == 0
-    assert all(line.startswith("warning: ") for line in told.err.splitlines())
-    assert told.out.startswith(f"{RUN}: 20 scans, 1.9 s")
-    for words in (
-        "trees found (TA) ",
-        "other objects left out (TR) ",
-        "mapped as trees (FA) ",
-        "missed (FR) ",
-        "completeness",
-        "mean pair error",
-        "path: RMS",
-        "median",
-    ):
-        assert words in told.out
-
-
 def test_the_record_holds_what_is_needed_to_map_again(mapped):
     record = json.loads((mapped / "run.json").read_text())
     assert record["source"]["uri"] == "sim:paper?duration=4"
@@ -432,23 +354,9 @@ def test_what_differs_from_the_preset_is_said_and_recorded(tmp_path, capsys):
     assert "preset forest" in stemmap(capsys, "map", RUN, "--out", tmp_path / "out").out.splitlines()
 
 
-def test_one_is_not_many(tmp_path, capsys):
-    told = stemmap(capsys, "map", RUN, "--out", tmp_path / "out", "--stop-after", "1")
-    assert f"{RUN}: 1 scan, 0.0 s" in told.out
-    frames = stemmap(capsys, "export", tmp_path / "out", "--out", tmp_path / "states").out
-    assert frames.startswith("1 frame with ")
-
-
 def test_evaluating_again_says_what_the_mapping_said(mapped, capsys):
     told = stemmap(capsys, "evaluate", mapped, "--json")
     assert json.loads(told.out) == json.loads((mapped / "run.json").read_text())["evaluation"]
-
-
-def test_evaluating_prints_the_lines_of_the_mapping(mapped, capsys):
-    told = stemmap(capsys, "evaluate", mapped)
-    assert told.code == 0
-    begin = [line.split(" ")[0] for line in told.out.splitlines()]
-    assert begin == ["trees", "not", "other", "completeness", "position"]
 
 
 def test_evaluating_by_a_table_and_by_other_distances(mapped, tmp_path, capsys):
@@ -498,19 +406,9 @@ def test_truth_that_judges_nothing_ends_with_1(mapped, tmp_path, capsys, rows, w
 @pytest.mark.parametrize(
     ("name", "content"),
     [
-        ("run.json", None),
         ("trees.csv", None),
-        ("run.json", ""),
-        ("run.json", "[]"),
-        ("run.json", "{}"),
-        ("run.json", '{"parameters": 3}'),
         ("run.json", '{"parameters": {"clustering": {"eps": 99}}}'),
-        ("run.json", "[" * 100_000),
-        ("trees.csv", "a,b\n"),
-        ("trees.csv", "\xff"),
-        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n1,2\n"),
         ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n1,2,3,4,five\n"),
-        ("path.csv", "t_s,x_m,y_m,yaw_rad,sigma_xy_m\n,,,,\n"),
     ],
 )
 def test_a_damaged_run_is_said_in_one_line(mapped, tmp_path, capsys, name, content):
@@ -612,17 +510,6 @@ def test_standing_still_is_warned_of(tmp_path, capsys):
     assert "warning:" in told.err
     assert "without motion" in told.err
     assert json.loads((tmp_path / "run.json").read_text())["odometry"] == "static"
-
-
-def test_presets_and_values_are_taken(tmp_path, capsys):
-    told = stemmap(
-        capsys, "map", RUN, "--out", tmp_path, "--preset", "paper", "--set", "slam.particles=5", "--seed", "3"
-    )
-    assert told.code == 0
-    record = json.loads((tmp_path / "run.json").read_text())
-    assert (record["preset"], record["seed"]) == ("paper", 3)
-    assert record["parameters"]["slam"]["particles"] == 5
-    assert record["parameters"]["clustering"]["eps"] == 0.25
 
 
 @pytest.mark.parametrize("library", ["json", "zenoh"])

@@ -44,11 +44,11 @@ SUFFIXES = {".py", ".js", ".html", ".css", ".j2", ".toml"}
 
 
 @cache
-def files() -> list[tuple[Path, list[str]]]:
-    """The files in which an extension may be named, with their lines."""
+def files() -> list[tuple[Path, str]]:
+    """The files in which an extension may be named, with their texts."""
     paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*"))]
     return [
-        (path, path.read_text(encoding="utf-8").splitlines())
+        (path, path.read_text(encoding="utf-8"))
         for path in paths
         if path.suffix in SUFFIXES and "vendor" not in path.parts
     ]
@@ -64,16 +64,14 @@ def test_each_extension_of_the_package_has_its_words():
 def test_only_its_own_files_name_an_extension(name):
     word = re.compile(WORDS[name], re.IGNORECASE)
     offenders = []
-    for path, lines in files():
+    for path, text in files():
         place = path.relative_to(ROOT).as_posix()
         is_own = f"extensions/{name}/" in place or f"extensions/survey_{name}" in place
         is_own |= place.startswith(f"tests/browser/extensions/test_{name}")
         is_own |= path == Path(__file__) or place == "tests/browser/extensions/test_loading.py"
-        if is_own:
-            continue
-        for number, line in enumerate(lines, 1):
-            if word.search(line):
-                offenders.append(f"{place}:{number} {line.strip()[:80]}")
+        if not is_own:
+            found = word.finditer(text)
+            offenders += [f"{place}:{text.count(chr(10), 0, m.start()) + 1} {m[0]}" for m in found]
     assert offenders == []
 
 

@@ -236,16 +236,9 @@ def runs(pid: int) -> bool:
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (["sim:nope"], 2, "there is no scenario 'nope' (sim:nope)"),
-        (["no/such/run.mcap"], 1, "there is no such file or folder (no/such/run.mcap)"),
-        (["serve", "--port", "x"], 2, "--port: 'x' is not a whole number"),
-        (["serve", "--preset", "best"], 2, "no preset 'best'"),
-        (["serve", "--set", "clustering.eps=99"], 2, "clustering.eps"),
         (["serve", "--host", "203.0.113.9", "--port", "0"], 1, "an address of this machine with --host"),
-        (["serve", "--host", "no.such.host.invalid"], 1, "with --host"),
         (["serve", "~nobody-of-this-name/x"], 1, "no such file or folder (~nobody-of-this-name/x)"),
         (["serve", ""], 2, "the source is empty"),
-        (["simulate", "stand", "--out", "never.mcap", "--seed", "-1"], 2, "'-1' is not a whole number"),
     ],
 )
 def test_a_wrong_start_prints_one_line(

@@ -92,12 +92,6 @@ def test_the_halves_compile_what_drives_with_troubles_and_a_slider_call():
     assert not told.stdout
 
 
-def test_nobody_is_started_where_all_is_kept(monkeypatch):
-    monkeypatch.setattr(numba_warmup, "is_compiled", lambda: True)
-    monkeypatch.setattr(numba_warmup, "_start", lambda half: pytest.fail(half))
-    numba_warmup.compile_ahead()
-
-
 def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
     started = []
 

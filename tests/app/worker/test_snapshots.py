@@ -61,16 +61,6 @@ def test_a_damaged_state_is_passed_over() -> None:
         assert kept.newest(100) == (50, 50)
 
 
-def test_a_state_of_other_contents_is_passed_over() -> None:
-    with closing(Snapshots(0)) as kept:
-        for scans in range(101):
-            kept.offer(scans, scans)
-        other = BlockFile()
-        kept._files[100] = other, None
-        assert other.put_block(0, b"no state")
-        assert kept.newest(100) == (50, 50)
-
-
 def test_a_run_that_cannot_go_back_stores_no_state() -> None:
     kept: Snapshots[int] = Snapshots(0, 0)
     assert not any(kept.is_due(scans) for scans in range(1000))

@@ -29,35 +29,6 @@ def far_from_trees(person: Dashboard) -> tuple[float, float]:
     return max(places, key=lambda place: min(math.dist(place, tree) for tree in trees))
 
 
-def test_a_wrong_row_of_a_file_is_mended_in_the_table(person: Dashboard, tmp_path: Path) -> None:
-    page, problem = person.page, person.page.locator("#plots-error")
-    page.locator("#coordinates-now").click()
-    page.locator("#coordinates-crs").fill("EPSG:25832")
-    trees = person.ask("/api/trees")["trees"][:3]
-    lines = [f"{t['number']},{EAST + t['x']:.3f},{NORTH + t['y']:.3f}" for t in trees]
-    lines[1] = f"{trees[1]['number']},5OOOOO,{NORTH + trees[1]['y']:.3f}"
-    file = tmp_path / "points.csv"
-    file.write_text("\n".join(["tree,easting,northing", *lines]))
-    page.get_by_label("File of control points").set_input_files(file)
-    expect(problem).to_have_text(
-        re.compile(r"^Point tree \d+, line 3: easting = '5OOOOO' is not a number\. Correct or delete it")
-    )
-    rows = page.locator("#control-points tbody tr")
-    expect(rows).to_have_count(3)
-    rows.nth(1).locator("[name=east]").fill(f"{EAST + trees[1]['x']:.3f}")
-    rows.nth(1).locator("[name=north]").fill(f"{NORTH + trees[1]['y']:.3f}")
-    rows.nth(2).locator("[name=tree]").fill("9999")
-    page.locator("#coordinates-apply").click()
-    expect(problem).to_have_text(re.compile("has no tree 9999"))
-    expect(rows).to_have_count(3)
-    rows.nth(2).locator("[name=tree]").fill(str(trees[2]["number"]))
-    page.locator("#coordinates-apply").click()
-    expect(page.locator("#coordinates-now")).to_have_text("Coordinates: EPSG:25832")
-    expect(problem).to_be_hidden()
-    page.locator("#plot-undo").click()
-    expect(page.locator("#coordinates-now")).to_have_text("Coordinates: local")
-
-
 def test_each_wrong_row_of_a_file_is_marked_until_it_is_changed(person: Dashboard, tmp_path: Path) -> None:
     page, problem = person.page, person.page.locator("#plots-error")
     page.locator("#coordinates-now").click()

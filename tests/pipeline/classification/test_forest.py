@@ -65,11 +65,8 @@ def test_a_figure_decides_at_its_threshold(tmp_path):
     [
         {"classes": ["tree"]},
         {ALL_AROUND: []},
-        {ALL_AROUND: 3},
-        {ALL_AROUND: [{"share": [1.0]}]},
         {ALL_AROUND: [{"share": [7.0, 0, 0, 0, 0, 0]}]},
         {ALL_AROUND: [{"figure": "colour", "at_most": 1.0, "yes": LEAF, "no": LEAF}]},
-        {ALL_AROUND: [{"figure": "tilt", "at_most": "high", "yes": LEAF, "no": LEAF}]},
         {ALL_AROUND: [{"figure": "tilt", "at_most": 1.0, "yes": LEAF}]},
         {ALL_AROUND: [{"figure": "tilt", "at_most": 10**400, "yes": LEAF, "no": LEAF}]},
     ],

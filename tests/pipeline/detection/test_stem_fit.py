@@ -210,13 +210,11 @@ RUBBISH = {
 
 
 @pytest.mark.parametrize("name", RUBBISH)
-@pytest.mark.parametrize("shape", [FOREST, PAPER], ids=["circle", "centroid"])
-@pytest.mark.parametrize(
-    "sensor", [SENSOR, Sensor(), Sensor(range_sigma=0.2)], ids=["vlp", "unknown", "poor"]
-)
-def test_rubbish_gives_a_usable_answer(name, shape, sensor):
+def test_rubbish_gives_a_usable_answer(name):
     points = RUBBISH[name]
-    assert_usable(describe(points.astype(np.float32), one_cluster(points), sensor, shape))
+    for shape in (FOREST, PAPER):
+        for sensor in (SENSOR, Sensor(), Sensor(range_sigma=0.2)):
+            assert_usable(describe(points.astype(np.float32), one_cluster(points), sensor, shape))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])

@@ -125,15 +125,7 @@ def test_trees_at_all_parts_of_a_long_path_count():
 
 @pytest.mark.parametrize(
     ("factor", "told"),
-    [
-        (1.0, ""),
-        (3.0, ""),
-        (0.3, ""),
-        (13.0, "10 times"),
-        (90.0, "100 times"),
-        (0.12, "1/10 of"),
-        (0.001, "1/1000 of"),
-    ],
+    [(3.0, ""), (0.3, ""), (13.0, "10 times"), (0.001, "1/1000 of")],
 )
 @pytest.mark.parametrize("n", [3, 4])
 def test_diameters_of_another_unit_are_doubted(factor, told, n):

@@ -102,7 +102,6 @@ def test_what_needs_a_drive_is_refused_for_a_cloud_in_its_own_words(mapped, clou
     ("error", "says"),
     [
         (OSError("the disk is gone"), "the disk is gone"),
-        (OSError(5, "Input/output error"), "Input/output error"),
         (MemoryError(), "memory"),
         (RuntimeError(), "RuntimeError"),
     ],

@@ -126,9 +126,7 @@ def test_the_side_of_a_sparse_trunk_is_no_wall():
     ("uri", "why"),
     [
         ("sim:cloud", "not named"),
-        ("sim:cloud?file=", "not named"),
         ("sim:cloud?file=a.laz&trees=3", "no option"),
-        ("sim:cloud?file=a.laz&odometry=psychic", "does not fit"),
         ("sim:cloud?file=a.laz&sigma=9", "does not fit"),
     ],
 )

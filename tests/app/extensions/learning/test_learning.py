@@ -263,15 +263,8 @@ def test_the_provenance_of_a_learned_forest_is_that_of_its_file(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "{",
-        "[]",
-        "[" * 99_999,
-        " " * 4_000_001,
-        json.dumps(data(**{ALL_AROUND: [{"share": [1, 0, 0, 0, 0, 0]}]})),
-    ],
-    ids=["empty", "torn", "list", "deep", "large", "other trees"],
+    ["{", "[" * 99_999, " " * 4_000_001, json.dumps(data(**{ALL_AROUND: [{"share": [1, 0, 0, 0, 0, 0]}]}))],
+    ids=["torn", "deep", "large", "other trees"],
 )
 def test_a_damaged_forest_is_refused_and_the_one_in_force_stays(tmp_path, text):
     name = Forests(tmp_path).keep(data())

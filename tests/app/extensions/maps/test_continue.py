@@ -107,11 +107,15 @@ def test_another_stand_is_not_found_in_the_map(stand, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_live_robot_needs_a_given_start(stand, tmp_path, capsys):
-    words = ["map", "zenoh:tcp/127.0.0.1:9?robot=r", "--continue", str(stand), "--out", str(tmp_path / "out")]
-    assert main(words) == 1
+def test_live_robots_need_a_given_start_and_others_scans(tmp_path, capsys, monkeypatch):
+    run, out = str(tmp_path / "run"), tmp_path / "out"
+    assert main(["map", PLAIN, "--out", run, "--stop-after", "3"]) == 0
+    assert main(["map", "zenoh:tcp/127.0.0.1:9?robot=r", "--continue", run, "--out", str(out)]) == 1
     assert "--start X,Y,YAW" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr("app.sources.one_step.is_one_step", lambda _uri, _options: True)
+    assert main(["map", PLAIN, "--continue", run, "--out", str(out)]) == 2
+    assert "no scans" in capsys.readouterr().err
+    assert not out.exists()
 
 
 @pytest.mark.slow
@@ -174,9 +178,3 @@ def test_a_map_without_a_drive_cannot_be_continued_or_merged(tmp_path, capsys):
     for words in (["map", PLAIN, "--continue", folder], ["merge", folder, folder]):
         assert main([*words, "--out", out]) == 1
         assert "no map of a drive and cannot be continued" in capsys.readouterr().err
-
-
-def test_a_source_without_scans_continues_no_map(stand, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("app.sources.one_step.is_one_step", lambda _uri, _options: True)
-    assert main(["map", PLAIN, "--continue", str(stand), "--out", str(tmp_path / "out")]) == 2
-    assert "no scans" in capsys.readouterr().err

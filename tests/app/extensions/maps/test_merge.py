@@ -33,7 +33,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert main(["simulate", "stand?seed=4&duration=17", "--out", str(folder / "whole.mcap")]) == 0
     _cut(folder / "whole.mcap", folder / "late.mcap", skip_s=5.0)
     assert main(["map", str(folder / "late.mcap"), "--out", str(folder / "b")]) in (0, 3)
-    assert main(["map", "sim:stand?seed=9&duration=12", "--out", str(folder / "other")]) == 0
+    assert main(["map", "sim:stand?seed=9&duration=6", "--out", str(folder / "other")]) == 0
     assert main(["merge", str(folder / "a"), str(folder / "b"), "--out", str(folder / "both")]) == 0
     return folder
 

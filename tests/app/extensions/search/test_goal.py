@@ -130,12 +130,8 @@ def test_bounds_come_from_the_declaration_and_can_be_narrowed():
         ("detection.e_min=5..1", "must be less"),
         ("detection.e_min=0..5", "is not within 1 to 1000"),
         ("detection.e_min=1", "two numbers"),
-        ("detection.e_min=nan..5", "is not within"),
         ("tracking.hits_to_confirm=1.5..4", "should be a whole number"),
-        ("shape.centre=circle,square", "is not one of centroid, circle"),
         ("shape.centre=circle", "at least two values"),
-        ("classification.forest", "at least two values"),
-        ("classification.forest=package,any", "classification.forest"),
         ("evaluation.reach=1..50", "how a map is scored"),
         ("obstacles.width=1..2", "does not change the map"),
     ],
@@ -158,13 +154,13 @@ def test_bounds_that_leave_no_set_are_told_by_their_contradiction():
 
 
 @given(st.data())
-@pytest.mark.parametrize("spec", [s for s in field_specs() if s.kind == "float"][:20], ids=lambda s: s.name)
-def test_what_is_tried_lies_within_the_bounds(spec, data):
-    axis = SearchAxis(spec.name, "float", spec.minimum or 0.0, spec.maximum or 1.0)
-    suggested = data.draw(st.floats(axis.low, axis.high))
-    value = axis.value_of(suggested)
-    assert axis.holds(value)
-    assert value == pytest.approx(suggested, rel=1e-3)
+def test_what_is_tried_lies_within_the_bounds(data):
+    for spec in (each for each in field_specs() if each.kind == "float"):
+        axis = SearchAxis(spec.name, "float", spec.minimum or 0.0, spec.maximum or 1.0)
+        suggested = data.draw(st.floats(axis.low, axis.high))
+        value = axis.value_of(suggested)
+        assert axis.holds(value)
+        assert value == pytest.approx(suggested, rel=1e-3)
 
 
 # --- the file -------------------------------------------------------------------------------------

@@ -129,12 +129,10 @@ async def test_rows_of_a_table_are_kept_where_others_are_wrong(both) -> None:
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ("tree,easting\n1,2\n", "header"),
-        ("tree,easting,northing\n", "no control points"),
         (
             "x_m,y_m,easting,northing\n" + "".join(f"{k},0,{500000 + k},5300000\n" for k in range(201)),
             "at most 200 control points",
-        ),
+        )
     ],
 )
 async def test_a_table_without_points_that_could_be_kept_is_refused(both, table: str, words: str) -> None:
@@ -190,33 +188,11 @@ async def test_a_system_without_a_code_can_be_applied_again(both) -> None:
     ("crs", "by", "words"),
     [
         (UTM, {"how": "hand", "east": 50.0, "north": 5.0}, "do not fit"),
-        ("EPSG:4326", {"how": "hand", "east": 9.0, "north": 48.0}, "degrees"),
-        ("EPSG:1", {"how": "hand", "east": 9.0, "north": 48.0}, "not a coordinate reference system"),
-        (UTM, {"how": "control"}, "no control points are too few"),
-        (UTM, {"how": "control", "points": [{"tree": 1, "east": 5e5, "north": 53e5}]}, "too few"),
-        (UTM, {"how": "control", "points": [{"east": 5e5, "north": 53e5}]}, "point 1 has no place"),
         (
             UTM,
             {"how": "control", "points": [{"tree": 99, "east": 5e5, "north": 53e5}]},
             "point 99: the map has no tree 99",
         ),
-        (
-            UTM,
-            {
-                "how": "control",
-                "points": [{"x": 1.0, "y": 1.0, "east": 5e5 + k, "north": 53e5} for k in range(3)],
-            },
-            "at one place",
-        ),
-        (
-            UTM,
-            {
-                "how": "control",
-                "points": [{"x": 9.0 * k, "y": 0.0, "east": 5e5 + k * k, "north": 53e5} for k in range(4)],
-            },
-            "contradict",
-        ),
-        (UTM, {"how": "guess"}, "guess"),
     ],
 )
 async def test_what_does_not_fit_is_refused_and_nothing_is_stored(

@@ -20,7 +20,6 @@ import pyproj
 import pytest
 import rasterio
 
-from app.batch.export import LOCAL_WKT
 from app.batch.map_frame import read_map_frame
 from app.batch.run_folder import read_run
 from app.extensions.stand.gis_files import LAYER_FIELDS
@@ -325,22 +324,7 @@ def test_the_terrain_is_a_raster_in_its_place(runs, tmp_path, capsys, name):
     assert np.isfinite(band).sum() == pytest.approx(1600, rel=0.03)
 
 
-@pytest.mark.parametrize(
-    ("to", "code", "message"),
-    [
-        ("trees.kml", 1, ".gpkg, .shp"),
-        ("missing/trees.gpkg", 1, "cannot read or write"),
-    ],
-)
-def test_what_cannot_be_written_is_refused(runs, capsys, tmp_path, monkeypatch, to, code, message):
-    monkeypatch.chdir(tmp_path)
-    stemmap(capsys, "export", runs["local"], "--to", to).refused(code, message)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("suffix", "package"), [("xlsx", "xlsxwriter"), ("gpkg", "pyogrio"), ("shp", "pyogrio")]
-)
+@pytest.mark.parametrize(("suffix", "package"), [("xlsx", "xlsxwriter")])
 def test_a_missing_package_is_named_with_its_extra(runs, capsys, tmp_path, monkeypatch, suffix, package):
     monkeypatch.setitem(sys.modules, package, None)
     result = stemmap(capsys, "export", runs["local"], "--to", tmp_path / f"x.{suffix}")
@@ -359,7 +343,7 @@ def test_a_cloud_with_a_reference_system_keeps_it(tmp_path, capsys):
         assert len(list(csv.reader(text))) == 101
 
 
-@pytest.mark.parametrize("crs", ["no system", LOCAL_WKT])
+@pytest.mark.parametrize("crs", ["no system"])
 def test_a_cloud_whose_reference_system_is_unknown_is_local(tmp_path, capsys, crs):
     run = grid_run(tmp_path / "cloud", cloud_crs=crs)
     assert read_map_frame(run).crs == ""

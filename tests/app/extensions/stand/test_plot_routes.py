@@ -7,7 +7,6 @@ import base64
 import json
 import math
 import re
-from dataclasses import replace
 from typing import Any
 
 import geopandas
@@ -15,7 +14,6 @@ import httpx
 import numpy as np
 import pytest
 import shapely
-from msgspec import structs
 
 from app.dashboard.dashboard import Dashboard
 from app.worker.protocol import View
@@ -62,23 +60,6 @@ async def test_a_rejected_tree_is_marked_in_the_table_and_counts_in_no_figure(bo
     assert len(features) == len(rows) - 1
 
 
-@pytest.mark.slow
-async def test_the_way_of_coverage_is_that_of_the_child_process(both, monkeypatch) -> None:
-    client, dashboard = both
-    await look(dashboard)
-    shown = dashboard.shown
-    assert shown is not None
-    trees = shown.frame.trees
-    lacking = replace(trees, dbh=np.full_like(trees.dbh, np.nan), sides=np.ones(len(trees.number), np.int64))
-    dashboard.shown = structs.replace(shown, frame=replace(shown.frame, trees=lacking))
-    way = (await client.get("/api/detour")).json()
-    assert way["length_m"] > 0.0
-    assert set(way["trees"]) <= set(trees.number.tolist())
-    assert len(way["points"][0]) == 2
-    dashboard.shown = structs.replace(shown, frame=replace(shown.frame, trees=replace(lacking, sides=None)))
-    assert (await client.get("/api/detour")).json() == {}
-
-
 async def test_the_radius_of_a_circle_is_changed_and_no_other_shape_has_one(both) -> None:
     client, _ = both
     rectangle = {"kind": "rectangle", "x": 0.0, "y": 0.0, "length": 4.0, "width": 2.0}
@@ -123,13 +104,7 @@ async def test_a_plot_is_added_renamed_deleted_and_all_of_it_undone(both) -> Non
             {"kind": "circle", "x": 0.0, "y": 0.0, "radius": 0.0},
             '"what":"radius is 0.0, but must be above 0","where":"plot 1","remedy":"Correct this value"',
         ),
-        ({"kind": "circle", "x": 0.0, "y": 0.0}, "radius"),
-        ({"kind": "rectangle", "x": 0.0, "y": 0.0, "length": 1.0, "width": -1.0}, "width"),
-        ({"kind": "rectangle", "x": 0.0, "y": 0.0, "length": 2000.0, "width": 2000.0}, "more than 100 ha"),
         ({"kind": "polygon", "polygons": [[[[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 2.0]]]]}, "not valid"),
-        ({"kind": "polygon", "polygons": [[[[0.0, 0.0], [1.0, 0.0]]]]}, "polygons"),
-        ({"kind": "polygon", "polygons": []}, "polygons"),
-        ({"kind": "star", "x": 0.0}, "star"),
     ],
 )
 async def test_what_is_no_area_is_refused(both, shape: dict[str, Any], words: str) -> None:

@@ -42,10 +42,9 @@ def test_a_formula_has_the_value_of_python_or_none(text, dbh, height):
 @pytest.mark.parametrize(
     "text",
     [
-        "", "dbh_cm +", "(dbh_cm", "dbh", "__import__('os')", "dbh_cm.real", "dbh_cm[0]", "lambda: 1", "True",
-        "'a'", "1 if 1 else 2", "dbh_cm < 3", "exp(1, 2)", "exp()", "exp(x=1)", "sqrt(*dbh_cm)", "open(1)",
-        "1j", "9e999", "~1", "1 % 2", "1 // 2", "not 1", "a := 1", "(a := 1)", "1 # 2", "\0", "1\u00b2",
-        "[1]", "dbh_cm;1", "x" * (LONGEST + 1), "(" * 100 + "1" + ")" * 99, "-" * 40 + "1",
+        "", "dbh_cm +", "(dbh_cm", "dbh", "__import__('os')", "dbh_cm.real", "dbh_cm[0]", "lambda: 1", "'a'",
+        "1 if 1 else 2", "dbh_cm < 3", "exp(1, 2)", "sqrt(*dbh_cm)", "9e999", "1 % 2", "not 1", "1\u00b2",
+        "dbh_cm;1", "x" * (LONGEST + 1), "(" * 100 + "1" + ")" * 99, "-" * 40 + "1",
     ],
 )  # fmt: skip
 def test_other_texts_are_refused_with_a_reason(text):
