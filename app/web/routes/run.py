@@ -176,9 +176,10 @@ async def open_source(
     body: _Source, dashboard: Dash, permitted: Permitted, settings: Deployment, check_only: bool = False
 ) -> Response:
     """POST /api/open: close the run and open another source, with its parameters if any are given; with
-    `check_only`, only check whether the source can be opened, and keep the run. The response is empty (202); the status reports the result. 403 for a file that the caller may not open, 422
-    for an unknown odometry, invalid parameters or a recording of what is not live, 409 if the source cannot
-    be opened or there is no data folder for a recording; the open run is kept then."""
+    `check_only`, only check whether the source can be opened, and keep the run. The response is empty (202);
+    the status reports the result. 403 for a file that the caller may not open, 422 for an unknown odometry,
+    invalid parameters or a recording of what is not live, 409 if the source cannot be opened or there is no
+    data folder for a recording; the open run is kept then."""
     chosen = {**body.model_dump(exclude={"record"}), "mount": mount_of_degrees(body.mount)}
     request = permitted_request(SourceRequest(**chosen), permitted)
     if body.record:
