@@ -34,6 +34,7 @@ from pipeline.io.block_file import BlockFile
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions, count_loss
 from pipeline.io.readers.camera import SAME_TIME_NS
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
+from pipeline.io.readers.topics import TRANSFORMS, is_fixed
 from pipeline.io.recording.messages import map_messages, scan_messages
 from pipeline.types.camera import Camera, Picture
 from pipeline.types.records import Frame, Path, Record, Truth
@@ -127,6 +128,11 @@ _POLL_S = 0.005
 _MOST_TOPICS = 10  # that a message lists
 #: Ends of the notices when the scans of a robot are not announced any more, and when they are again.
 GONE, BACK = "sends no scans any more", "sends scans again"
+#: End of the notice about a topic of fixed transforms.
+LATE = (
+    "was announced after the topics of the run were chosen and is not read: if it tells where the LiDAR is, "
+    "trees and poses may be wrong. Open the run again, or state the mounting"
+)
 #: Path and trees are published and recorded at this interval [s]; the pose at every scan.
 _MAP_PAUSE_S = 1.0
 
@@ -159,6 +165,7 @@ class LiveSource:
         self._reader: ArrivalReader | None = None
         self._seen_s: float | None = None
         self._there: bool | None = None
+        self._late: set[str] = set()  # topics of fixed transforms
         self._ending = threading.Event()
         self._notices: list[str] = []
         self._early: list[Record] = []
@@ -515,7 +522,7 @@ class LiveSource:
 
     def _note_presence(self, choice: Choice) -> None:
         """Update whether the chosen scans are still announced, and add a notice if that changed, not at the
-        first call."""
+        first call, and one for each topic of fixed transforms that was announced too late."""
         self._version = self._link.version
         publishers = self._link.publishers()
         scan = choice.channels[0].topic
@@ -524,6 +531,12 @@ class LiveSource:
             if self._there is not None:
                 self._notices.append(f"{self._name()} {BACK if there else GONE}")
             self._there = there
+        mine = [p for p in publishers if p.msgtype == TRANSFORMS and p.robot in (choice.robot, "")]
+        topics = {p.topic for p in mine if is_fixed(p.topic)}
+        late = topics - {channel.topic for channel in choice.channels} - self._late
+        if self._options.T_base_lidar is None:
+            self._notices += [f"{topic} {LATE}" for topic in sorted(late)]
+        self._late |= late
 
     def _choose(self) -> None:
         """Choose the topics once scans have been announced for `_SETTLE_S`, start the recorder and subscribe;
@@ -546,7 +559,7 @@ class LiveSource:
         options = replace(self._options, topics=topics)
         reader = ArrivalReader(self.uri, self._address.kind, choice.channels, options)
         everything = (*choice.channels, *choice.camera)
-        fixed = [channel for channel in choice.channels if channel.topic.endswith("tf_static")]
+        fixed = [channel for channel in choice.channels if is_fixed(channel.topic)]
         if choice.camera:
             self._camera = LiveCamera(choice.camera, fixed)
         if self._publishes and self._link.session is not None:

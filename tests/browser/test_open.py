@@ -137,7 +137,7 @@ def test_the_topics_are_read_again_after_another_address_of_a_robot(dialog: Page
     asked: list[str] = []
 
     def answer(route: Route) -> None:
-        asked.append(json.loads(route.request.post_data or "{}")["uri"])
+        asked.append(json.loads(route.request.post_data or "")["uri"])
         route.fulfill(json={"topics": [], "mount": None, "warnings": [f"Topics of {asked[-1]}"]})
 
     dialog.route("**/api/inside", answer)

@@ -120,10 +120,9 @@ async def replay(
     key: Key, dashboard: Dash, settings: Deployment, permitted: Permitted, check_only: bool = False
 ) -> Response:
     """Open the source of a run again, with its topics, mounting and final parameters; with `check_only`, only
-    check whether it can be opened. The response is empty
-    (202); the status reports the result. 403 if the file may not be opened by the caller, 404 for an unknown
-    run, 409 if it was live or its source cannot be opened, 422 if its parameters are not valid in this
-    version."""
+    check whether it can be opened. The response is empty (202); the status reports the result. 403 if the
+    file may not be opened by the caller, 404 for an unknown run, 409 if it was live or its source cannot be
+    opened, 422 if its parameters are not valid in this version."""
     run = await whole_run(key, settings, dashboard)
     if run["live"]:  # its address would end the open run, and map what the robot sends now
         raise StemmapError(

@@ -22,7 +22,7 @@ from pipeline.io.readers.robot_body import body_words
 from pipeline.io.readers.ros_description import RosOpening, describe
 from pipeline.io.readers.ros_first_scans import find_first_scan, times_of_topic
 from pipeline.io.readers.ros_messages import Content, TimedMessages
-from pipeline.io.readers.ros_mounting import contradiction_of_yaw, find_mounting
+from pipeline.io.readers.ros_mounting import LateTransforms, contradiction_of_yaw, find_mounting
 from pipeline.io.readers.ros_odometry import choose_odometry, first_frames, nearness
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.ros_tilt import TiltCheck, check_tilt, spread_scans
@@ -165,6 +165,7 @@ class RosSource(MessageSource):
         if median_range(found.scan) > FARTHEST_MEDIAN:
             count_loss(self._damage, NO_METRES, scans.count)
         mounting = find_mounting(found, odometry, extrinsics, messages, decoder, options, live=live)
+        self._late = LateTransforms(extrinsics, mounting, every.transforms(fixed=True))
         tilted = mounting.T_base_lidar if mounting.is_assumed and not mounting.shows_yaw else None
         if tilted is not None and abs(tilted.R[2, 2]) < _UPRIGHT:
             count_loss(self._damage, UNKNOWN_YAW, scans.count)
@@ -224,6 +225,8 @@ class RosSource(MessageSource):
             message: The message.
             losses: Dict from reasons to numbers of contents that cannot be used; increased in place.
         """
+        if late := self._late.notice(message):
+            self.notices.append(late)
         if message.channel in self._wanted():
             for stamped in self._reader.messages.times_of(self._live_clock, message, losses):
                 self._alignments.add(stamped)

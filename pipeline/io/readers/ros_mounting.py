@@ -3,6 +3,7 @@ the scans beside the odometry."""
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from pipeline.io.readers.ros_messages import TimedMessages
 from pipeline.io.readers.ros_odometry import OdometryChoice
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.topics import Topics
-from pipeline.io.readers.transforms import Extrinsics, TransformTree
+from pipeline.io.readers.transforms import USUAL_BASES, Extrinsics, TransformTree
 from pipeline.types.records import Int, Odometry, Scan
 
 if TYPE_CHECKING:
@@ -146,6 +147,49 @@ def _mounting_by_frames(
     return Mounting(
         base, frame, odometry, stated or linked, is_stated=stated is not None, warnings=tuple(warnings)
     )
+
+
+class LateTransforms:
+    """Finds fixed transforms of a live run that tell another mounting of the LiDAR than the one that is used.
+    They are not used: the map would go on with another LiDAR than it began with.
+
+    Args:
+        extrinsics: Transforms that are known when the mounting is found, before the measured one is added.
+        mounting: The mounting that is used.
+        fixed: Numbers of the channels of fixed transforms.
+    """
+
+    def __init__(self, extrinsics: Extrinsics, mounting: Mounting, fixed: frozenset[int]) -> None:
+        """Copy the known transforms."""
+        self._extrinsics, self._mounting, self._fixed = extrinsics, mounting, fixed
+        self._tree = deepcopy(extrinsics.tree)
+        self._known = mounting.T_base_lidar or Pose3.identity()
+
+    def notice(self, message: Message) -> str:
+        """Return a message for the user if a message has such a transform, once for each mounting; "" if not,
+        and where the user states the mounting or the clouds are in the frame of a map."""
+        lidar, base = self._mounting.lidar, self._mounting.base
+        is_fixed = message.channel in self._fixed
+        if not is_fixed or not lidar or self._mounting.is_stated or self._mounting.odometry.world:
+            return ""
+        for _, link, pose in self._extrinsics.decode(message, {}):
+            self._tree.add(*link, pose)
+        for name in (base,) if base not in ("", lidar) else USUAL_BASES:
+            T = self._tree.find(name, lidar)
+            if name == lidar or T is None or _is_same(T, self._known):
+                continue
+            self._known = T
+            return (
+                f"the fixed transform from {lidar} to {name} arrived after the first scans and is not used: "
+                "the LiDAR stays where it was taken to be, and trees and poses may be wrong. Open the run "
+                "again, or state the mounting"
+            )
+        return ""
+
+
+def _is_same(a: Pose3, b: Pose3) -> bool:
+    """Return whether two poses are the same up to rounding."""
+    return np.allclose(a.R, b.R, atol=1e-6) and np.allclose(a.t, b.t, atol=1e-6)
 
 
 def _usual_lidar(tree: TransformTree, base: str) -> str:

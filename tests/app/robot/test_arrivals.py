@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SourceError
+from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import OPENING_LIMIT, ArrivalReader
@@ -49,6 +50,25 @@ def test_a_row_of_messages_gives_the_records_of_its_file(drive: Path):
         assert ours == theirs
         assert len(ours) == SCANS
         assert not any(isinstance(record, Notice) for record in records)
+
+
+def test_a_fixed_transform_after_the_first_scans_is_told_and_not_used(drive: Path):
+    with closing(McapFile(drive)) as container:
+        (fixed,) = [c.number for c in container.channels if c.topic.endswith("tf_static")]
+        messages = list(container.messages([c.number for c in container.channels], None, {}))
+    (mounting, *_) = [message for message in messages if message.channel == fixed]
+    others = [message for message in messages if message.channel != fixed]
+    late = [replace(mounting, log_ns=message.log_ns) for message in others[-2:]]  # it is sent twice
+    for rest, told in (([*others, *late], 1), ([mounting, *others, *late], 0)):
+        reader, records = read(container.channels, iter(rest))
+        assert reader.description is not None
+        assert (reader.description.T_base_lidar.t[2] == 0.9) == (told == 0)
+        notices = [record.text for record in records if isinstance(record, Notice)]
+        assert len(notices) == told
+        assert all("arrived after the first scans and is not used" in notice for notice in notices)
+    options = SourceOptions(T_base_lidar=Pose3.identity())
+    reader = ArrivalReader("here", "live", container.channels, options)
+    assert not any(isinstance(r, Notice) for message in [*others, *late] for r in reader.add(message))
 
 
 def test_a_planar_laser_and_fixes_count_live_too(tmp_path: Path):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from app.robot.link import Inbox, Link
-from app.robot.source import LiveSource
+from app.robot.source import LATE, LiveSource
 from app.robot.topics import Publisher
 from app.sources.live_address import ZenohAddress, parse_address
 from app.worker.loop import WorkerLoop
@@ -202,6 +202,28 @@ def test_a_robot_is_waited_for_mapped_lost_and_back(sending):
             counts.warnings
         )
         assert on.shown == sorted(set(on.shown)), "each scan is shown once"
+
+
+def test_fixed_transforms_that_come_late_are_told_on_the_page_and_in_the_card_of_the_run(sending):
+    fixed = [topic for topic in sending.topics if topic.topic.endswith("tf_static")]
+    with stage() as on:
+        on.commands.put(Open(URI))
+        until(lambda: on.links)
+        link = on.links[0]
+        announce(link, sending)
+        link.there = [p for p in link.there if p.topic not in [topic.topic for topic in fixed]]
+        until(lambda: link.channels)
+        sending(link, 0, 11)
+        until(on.opened)
+        on.commands.put(Begin(1, Parameters().model_dump(), 3, True))
+        until(lambda: on.shown and on.shown[-1] == 10)
+        announce(link, sending)
+        until(lambda: any(LATE in warning for warning in on.status.warnings))
+        sending(link, 11, SCANS)
+        until(lambda: on.shown[-1] == SCANS - 1)
+        counts = [message.counts for message in on.said if isinstance(message, Shown)][-1]
+        assert counts is not None
+        assert sum(LATE in warning for warning in counts.warnings) == 1
 
 
 @pytest.mark.parametrize(
