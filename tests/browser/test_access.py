@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from playwright.sync_api import Browser, expect
 
@@ -29,6 +31,15 @@ def test_single_keys_are_switched_off(dashboard: Dashboard):
     page.locator("body").press("m")
     expect(measure).to_have_attribute("aria-pressed", "true")
     page.locator("body").press("m")
+
+
+def test_settings_tell_what_the_run_keeps(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("body").press("?")
+    expect(page.locator("#run-storage")).to_contain_text(
+        re.compile(r"^This run keeps \d+\.\d of 2\.0 GB in temporary files and \d+ of 450 MB in memory")
+    )
+    page.keyboard.press("Escape")
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])

@@ -117,7 +117,7 @@ CENTIMETRES = {
 
 
 @pytest.mark.slow_after(1)
-@pytest.mark.parametrize("choice", ["distance", "quantities"])
+@pytest.mark.parametrize("choice", ["distance", "error", "time", "n_eff", "sigma", "quantities"])
 @pytest.mark.usefixtures("calm")
 def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
     start = dashboard.ask("/api/status")["scan_index"]

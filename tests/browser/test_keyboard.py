@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.browser.conftest import opened
@@ -69,6 +70,22 @@ def test_a_run_is_opened_tuned_annotated_and_exported(chromium: Browser, server:
         assert len(rows) > 3
         assert rows[0].startswith("tree,x_m,y_m")
         dashboard.reset()
+
+
+@pytest.mark.usefixtures("calm")
+def test_escape_closes_the_welcome_card_while_the_scene_loads(chromium: Browser, server: Server):
+    context = chromium.new_context(viewport={"width": 1260, "height": 720})
+    try:
+        page = context.new_page()
+        page.goto(f"{server.link}&fixedDpr=0.3")
+        expect(page.locator("#welcome")).to_be_visible()
+        page.wait_for_function("() => document.querySelector('#scene').contentWindow?.__viserMutable?.scene")
+        page.wait_for_timeout(2000)  # viser's client takes the focus once it is drawn
+        assert page.evaluate("() => document.activeElement.id") == "welcome-on"
+        page.keyboard.press("Escape")
+        expect(page.locator("#welcome")).to_be_hidden()
+    finally:
+        context.close()
 
 
 def test_the_marks_and_the_rows_have_one_tab_stop_each_and_arrows_move_inside(dashboard: Dashboard):

@@ -46,6 +46,20 @@ def test_the_scene_has_half_of_the_window_and_is_exchanged_with_the_map(wide: Da
     assert box(scene)["x"] == 0
 
 
+def test_each_layout_has_a_key_that_opens_its_tab(wide: Dashboard):
+    page = wide.page
+    names = page.locator("#layout-names")
+    for key, name, tab in (
+        ("Shift+R", "Results", "scores"),
+        ("Shift+T", "Tune", "tune"),
+        ("Shift+A", "Annotate", "annotate"),
+        ("Shift+M", "Monitor", "trees"),
+    ):
+        page.locator("body").press(key)
+        expect(page.locator(f"#panel-{tab}")).to_be_visible()
+        expect(names).to_have_value(name)
+
+
 def test_edges_are_dragged_and_moved_by_keys_and_are_there_after_a_reload(wide: Dashboard):
     page = wide.page
     page.locator("body").press("x")  # the map is on the left
@@ -130,3 +144,30 @@ def test_a_stored_layout_that_is_not_one_is_ignored(wide: Dashboard):
         expect(page.locator("section.map")).to_be_visible()
         assert box(page.locator("section.map"))["width"] >= 0.14 * WIDTH
     page.evaluate("localStorage.removeItem('stemmap.layout')")
+
+
+def test_the_scene_can_be_hidden_and_comes_back_with_what_lies_over_it(wide: Dashboard):
+    page = wide.page
+    scene, plan = page.locator("section.scene"), page.locator("#map")
+    wide.tab("Annotate")
+    page.locator("#layout-button").click()
+    page.locator("#layout-scene").uncheck()
+    page.locator("body").press("Escape")
+    expect(scene).not_to_be_visible()
+    assert box(page.locator("#panel-annotate"))["height"] > 0.6 * HEIGHT
+    assert box(plan)["width"] > 0.4 * WIDTH
+    page.reload()
+    wide.pause()
+    expect(scene).not_to_be_visible()
+    page.locator("body").press("c")  # A | B lies over the scene
+    expect(scene).to_be_visible()
+    expect(page.locator("#over-compare")).to_be_visible()
+    page.locator("body").press("Escape")
+
+    # One part is always there.
+    page.locator("#layout-button").click()
+    for part in ("map", "tabs", "scene"):
+        page.locator(f"#layout-{part}").click()
+    expect(page.locator("#layout-scene")).to_be_checked()
+    for part in ("map", "tabs"):
+        page.locator(f"#layout-{part}").check()

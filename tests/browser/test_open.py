@@ -114,6 +114,18 @@ def test_the_choices_of_a_cloud_and_the_boxes_of_two_runs_are_of_their_extension
     dialog.locator("#source-button").click()
 
 
+def test_the_dialog_keeps_its_size_while_it_is_open(dialog: Page) -> None:
+    box = dialog.locator("#source-dialog").bounding_box()
+    dialog.locator("#source-robot summary").click()
+    dialog.locator("#source-inside summary").click()
+    assert dialog.locator("#source-dialog").bounding_box() == box
+    dialog.locator("#source-inside summary").click()
+    dialog.locator("#source-robot summary").click()
+    dialog.locator("#source-uri").fill("nothing like it")
+    expect(dialog.locator("#source-none")).to_be_visible()
+    assert dialog.locator("#source-dialog").bounding_box() == box
+
+
 def test_a_dialog_that_was_left_begins_with_the_whole_list_and_records_again(dialog: Page) -> None:
     field, record = dialog.locator("#source-uri"), dialog.locator("#source-record")
     listed = dialog.locator("#source-list button:visible")

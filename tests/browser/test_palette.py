@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import pytest
 from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
@@ -17,6 +18,19 @@ FOUND = {
     "upload rec": "Upload a recording",
     "fewer points in a cluster": "Minimum points",
 }
+
+
+def test_arrow_keys_select_and_the_list_is_accessible(dashboard: Dashboard):
+    page = dashboard.page
+    page.locator("#palette-button").click()
+    find = page.locator("#palette-find")
+    for place in (1, 2):
+        find.press("ArrowDown")
+        expect(find).to_have_attribute("aria-activedescendant", f"palette-{place}")
+        expect(page.locator(f"#palette-{place}")).to_have_attribute("aria-selected", "true")
+    find.press("Escape")
+    expect(page.locator("#palette")).to_be_hidden()
+    expect(page.locator("#palette-button")).to_be_focused()
 
 
 def test_the_list_of_shortcuts_names_every_key(dashboard: Dashboard):
@@ -97,3 +111,25 @@ def test_actions_are_found_and_executed(dashboard: Dashboard):
     expect(page.locator("#panel-story")).to_have_attribute("data-story", f"tree {number}")
     page.locator("#map").press("Escape")
     assert dashboard.errors == []
+
+
+@pytest.mark.parametrize(
+    ("word", "found"),
+    [
+        ("annotate", "Tab Annotate"),
+        ("help", "Settings and keyboard shortcuts"),
+        ("zoom", "Zoom in on the map"),
+        ("delete", "Annotate: delete the chosen annotation"),
+        ("screenshot", "Save the map as a picture (PNG)"),
+        ("qgis", "Export the map: GeoPackage"),
+        ("resolution", "Voxel size"),
+    ],
+)
+def test_actions_and_settings_are_found_by_other_words(dashboard: Dashboard, word: str, found: str):
+    page = dashboard.page
+    page.locator("#palette-button").click()
+    page.locator("#palette-find").fill(word)
+    expect(page.locator("#palette-list [role=option]", has_text=found).first).to_be_visible()
+    if found.startswith("Tab "):
+        expect(page.locator("#palette-list [role=option]").first).to_have_text(found)
+    page.keyboard.press("Escape")

@@ -168,6 +168,15 @@ def test_both_panels_have_the_same_parameters_in_the_same_order_and_undo_works_f
         dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 0.15")
 
 
+def test_points_have_a_bounded_size_and_the_view_an_angle_of_45_degrees(dashboard: Dashboard):
+    dashboard.scene.wait_for_function(
+        """() => { const all = [];
+        window.__viserMutable.scene.traverse(node => node.isPoints && all.push(node.material.vertexShader));
+        return all.length > 0 && all.every(text => text.includes("clamp(scale")); }"""
+    )
+    assert dashboard.scene.evaluate("() => window.__viserMutable.camera.fov") == pytest.approx(45.0, abs=0.1)
+
+
 def test_one_file_uses_private_objects_of_the_client_of_viser():
     private = re.compile(r"__viser|nodeRefFromName|cameraControl|uLabelData|setColorAt|vertexShader")
     used = [path.name for path in SCRIPTS.rglob("*.js") if private.search(path.read_text())]
@@ -280,6 +289,16 @@ def test_keys_work_on_the_page_and_in_the_scene(dashboard: Dashboard):
     page.keyboard.press("Escape")
     page.locator("#map").press("?")
     expect(page.get_by_role("heading", name="Settings and keyboard shortcuts")).to_be_visible()
+
+
+def test_a_key_of_the_page_switches_following(dashboard: Dashboard):
+    scene = dashboard.scene
+    follow = dashboard.page.locator("#follow")
+    expect(follow).to_have_attribute("aria-pressed", "true")
+    dashboard.page.locator("#map").press("f")
+    expect(follow).to_have_attribute("aria-pressed", "false")
+    scene.locator("canvas").first.press("f")
+    expect(follow).to_have_attribute("aria-pressed", "true")
 
 
 def test_a_layer_is_switched_off(dashboard: Dashboard):
@@ -467,3 +486,61 @@ GROUND = """() => {
   while (node && !node.style.backgroundColor) node = node.parentElement;
   return getComputedStyle(node).backgroundColor;
 }"""
+
+
+# How many trees of the scene are grey, and how many there are.
+GREYED = """() => {
+  let mesh = null;
+  const node = window.__viserMutable.nodeRefFromName['/world/trees'];
+  node.traverse(each => { if (each.getColorAt) mesh ??= each; });
+  const isGrey = (k) => { const { r, g, b } = mesh.getColorAt(k); return r === g && g === b; };
+  const all = Array.from({ length: mesh.instancesCount }, (_, k) => isGrey(k));
+  return [all.filter(Boolean).length, all.length];
+}"""
+
+
+@pytest.mark.usefixtures("calm")
+def test_the_scene_greys_the_trees_that_the_filter_leaves_out(dashboard: Dashboard):
+    dashboard.load_scene()
+    dashboard.tab("Trees")
+    measured = sum(row["dbh_cm"] is not None for row in trees_of(dashboard))
+    greyed = lambda: dashboard.scene.evaluate(GREYED)  # noqa: E731
+    assert greyed()[0] == 0
+    dashboard.page.locator("#find").fill("dbh > 30")
+    count = dashboard.page.locator("#trees tbody tr").count
+    dashboard.eventually(lambda: greyed()[0] == greyed()[1] - count() and 0 < count() < measured, greyed)
+    dashboard.page.locator("#find").fill("")
+    dashboard.eventually(lambda: greyed()[0] == 0, greyed)
+
+
+def trees_of(dashboard: Dashboard) -> list[dict[str, float | None]]:
+    """The trees of the map that the page shows."""
+    read = "async () => (await import('/static/js/core/store.js')).trees()"
+    return list(dashboard.page.evaluate(read))
+
+
+def test_the_notice_of_software_rendering_closes_by_itself(dashboard: Dashboard):
+    """It covers a part of the scene; a browser that showed it before closes it at once."""
+    scene = dashboard.scene
+    shown = "() => localStorage.getItem('stemmap.rendering-notice')"
+    if dashboard.page.evaluate(shown) is None:
+        pytest.skip("this browser renders in hardware")
+    scene.wait_for_function(
+        "() => ![...document.querySelectorAll('[class*=mantine-Notification-root]')]"
+        ".some(({ textContent }) => textContent.includes('Software WebGL'))"
+    )
+
+
+def test_the_panel_leaves_a_small_scene_free(wide: Dashboard):
+    page, scene = wide.page, wide.scene
+    slider = scene.get_by_role("slider", name="Radius eps").first
+    expect(slider).to_be_visible()
+    split = page.locator("#split-left")
+    split.focus()
+    for _ in range(60):
+        if page.locator("#scene").evaluate("node => node.clientWidth") < 540:
+            break
+        split.press("ArrowLeft")
+    expect(slider).to_be_hidden()
+    split.dblclick()
+    expect(slider).to_be_visible()

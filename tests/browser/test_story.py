@@ -68,6 +68,12 @@ def test_the_story_of_a_tree_that_a_person_rejected_says_so(dashboard: Dashboard
     expect(story.locator("[data-rejected]")).to_have_count(0)
 
 
+def test_a_place_that_no_scan_viewed_clearly_has_no_sentence_of_views(dashboard: Dashboard):
+    say = "async (counts) => (await import('/static/js/explain/columns.js')).clearViewText(...counts)"
+    assert dashboard.page.evaluate(say, [0, 0]) == ""
+    assert "In 0 of 1 scan with" in dashboard.page.evaluate(say, [0, 1])
+
+
 def test_the_story_of_a_cluster_remains_while_the_run_plays(dashboard: Dashboard):
     page = dashboard.page
     panel = dashboard.tab("Clusters")

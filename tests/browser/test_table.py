@@ -128,6 +128,20 @@ def painted(file: Path) -> int:
         return len(picture.convert("RGB").getcolors(1 << 24) or [])
 
 
+def test_the_map_is_saved_as_a_picture_and_as_a_table(dashboard: Dashboard, tmp_path: Path):
+    page, held = dashboard.page, trees(dashboard)
+    picture = saved(page, page.locator("#map-png"), tmp_path)
+    assert picture.name == "map.png"
+    assert painted(picture) > 20
+    head, *rows = table(saved(page, page.locator("#map-csv"), tmp_path))
+    assert head == ["what", "number", "x_m", "y_m", "dbh_cm"]
+    drawn = {int(row[1]): (float(row[2]), float(row[3])) for row in rows if row[0] == "tree"}
+    assert drawn == {tree["number"]: (tree["x"], tree["y"]) for tree in held}
+    scan = dashboard.ask("/api/status")["scan_index"]
+    assert sum(row[0] == "path" for row in rows) == scan + 1
+    assert any(row[0] == "truth: tree" for row in rows)
+
+
 def test_the_table_is_saved_as_a_picture_and_as_a_table(dashboard: Dashboard, tmp_path: Path):
     page, held = dashboard.page, trees(dashboard)
     whole = saved(page, page.locator("#trees-png"), tmp_path)
@@ -239,3 +253,12 @@ def test_the_head_of_the_table_and_the_map_tell_what_lacks_for_a_diameter(dashbo
     entry = dashboard.page.locator("#legend-unseen").bounding_box()
     assert entry is not None
     assert entry["width"] > 60
+
+
+def test_the_filter_ends_with_the_run(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    page.locator("#find").fill("dbh > 1000")
+    expect(page.locator("#tree-count")).to_contain_text("0 of")
+    dashboard.open("sim:stand?duration=3")
+    expect(page.locator("#find")).to_have_value("")

@@ -182,3 +182,10 @@ def test_sliders_are_in_view_and_none_moves_while_one_is_dragged(
     lowest.press("Escape")
     dashboard.errors.clear()
     page.set_viewport_size(before)
+
+
+def test_a_change_that_does_not_alter_the_map_is_said(dashboard: Dashboard):
+    field = value(dashboard.page, "filters.z_max")
+    field.fill("19.95")
+    field.press("Enter")
+    expect(dashboard.page.locator("#tune-whole-status")).to_contain_text("the same as before")

@@ -198,6 +198,12 @@ async def test_a_bad_change_names_parameter_and_bound(
     assert dashboard.parameters.as_plain() == before
 
 
+async def test_an_unknown_preset_or_name_is_refused(both: Running) -> None:
+    client, _ = both
+    assert (await client.post("/api/parameters/preset", json={"name": "best"})).status_code == 422
+    assert (await client.post("/api/parameters/reset", json={"names": ["best"]})).status_code == 422
+
+
 async def test_the_download_is_what_config_takes(both: Running) -> None:
     client, _ = both
     await client.patch("/api/parameters", json={"changes": {"slam.particles": 33}})
@@ -248,6 +254,12 @@ async def test_only_a_live_run_is_recorded_later(both: Running) -> None:
     answer = await client.post("/api/command", json={"type": "record"})
     assert answer.status_code == 422
     assert "only a live run can be recorded" in answer.text
+
+
+@pytest.mark.parametrize("body", [{"uri": ""}, {"uri": "sim:stand", "odometry": "guess"}])
+async def test_what_cannot_be_opened_is_refused(both: Running, body: dict[str, Any]) -> None:
+    client, _ = both
+    assert (await client.post("/api/open", json=body)).status_code == 422
 
 
 async def test_from_the_network_only_offered_files_are_opened(tmp_path: Path) -> None:

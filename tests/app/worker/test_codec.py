@@ -170,3 +170,10 @@ def test_a_stream_that_ends_within_a_message_is_an_error(cut: int) -> None:
     packed = to_worker().encode(Seek(1.0))
     with pytest.raises(WireError, match="ends within"):
         to_worker().read(io.BytesIO(packed[:cut]))
+
+
+def test_arrays_of_other_kinds_are_not_sent() -> None:
+    odd = np.array(["a"], dtype=object)
+    truth = TruthTrees(x=odd, y=odd, dbh=odd, kind=("tree",))
+    with pytest.raises(WireError, match="cannot be sent"):
+        from_worker().encode(Opened("u", "k", "forest", None, None, truth))

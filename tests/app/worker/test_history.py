@@ -60,6 +60,16 @@ def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch
     assert story.x[-1] > 2500
 
 
+def test_a_long_history_is_story_with_its_ends():
+    history = TreeHistory()
+    for index in range(1500):
+        record(history, seen(index, float(index)))
+    story = history.of(1, 10**6)
+    assert len(story.x) <= 200
+    assert story.x[0] == 0.0
+    assert story.x[-1] == 1499.0
+
+
 @given(st.floats(0.1, 5.0), st.floats(0.01, 1.0), st.floats(-1.5, 1.5))
 def test_half_axes_give_the_ellipse_back(major: float, part: float, angle: float):
     minor = part * major

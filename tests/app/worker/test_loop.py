@@ -9,7 +9,7 @@ import queue
 import threading
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -205,6 +205,12 @@ def test_the_answer_to_an_opening_begins_that_run_only() -> None:
     assert pictures(said) == pictures(expected)
 
 
+def test_a_late_answer_alone_plays_nothing() -> None:
+    said = driven(FakeSource(5), Open("first:"), Open("second:"), begin(1))
+    assert shown(said) == []
+    assert last_status(said).state == "paused"
+
+
 def test_a_pause_while_opening_is_kept_and_without_play_the_first_scan_is_shown() -> None:
     said = driven(FakeSource(5), Open("fake:"), Pause(), begin(1))
     assert (shown(said), last_status(said).state) == ([], "paused")
@@ -293,6 +299,11 @@ def test_a_fault_is_logged_and_survived(capsys: pytest.CaptureFixture[str]) -> N
     assert "ZeroDivisionError: a fault on purpose" in capsys.readouterr().err
     assert shown(said)[-1] == 2
     assert last_status(said).state == "paused"
+
+
+def test_values_that_are_no_parameters_are_refused() -> None:
+    said = driven(FakeSource(5), Open("fake:"), SetParameters({"clustering": {"eps": "wide"}}, 1))
+    assert "clustering.eps" in last_status(said).detail
 
 
 def received(stream: io.BytesIO) -> list[FromWorker]:
@@ -525,3 +536,12 @@ def test_no_more_scans_are_behind_than_the_run_has_left(monkeypatch):
     assert driver._behind(status, 0.0) == 204
     assert driver._behind(replace(status, scans=None), 0.0) == 696  # nobody knows how many there are
     assert driver._behind(replace(status, live=True, scans_behind=3), 0.0) == 3
+
+
+def test_a_message_with_a_value_that_cannot_be_sent_is_dropped_and_the_next_one_is_sent() -> None:
+    stream = io.BytesIO()
+    mailbox = Outbox(stream)
+    mailbox.put(Answer(1, missing=cast(Any, object())))
+    mailbox.put(Answer(2))
+    mailbox.close(5.0)
+    assert [message.ticket for message in received(stream) if isinstance(message, Answer)] == [2]

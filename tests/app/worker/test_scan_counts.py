@@ -48,6 +48,15 @@ def test_scans_count_once_until_they_are_forgotten() -> None:
     assert counts.totals(1, [], {}).warnings == ["slow"]
 
 
+def test_a_scan_takes_92_bytes() -> None:
+    counts, scans = ScanCounts(), 300
+    for index in range(scans):
+        counts.record(scan(index, Verdict.TREE))
+    each = 4 * (len(Verdict) + 3) + 8  # numbers by verdict and pose quality, sigma
+    assert each == 92
+    assert sum(column.nbytes for column in counts._rows._columns) <= 2 * each * scans  # the capacity doubles
+
+
 def test_warnings_take_memory_for_each_scan_that_has_them() -> None:
     """Texts with numbers differ from scan to scan, such as those of jumps of the odometry."""
     counts, scans = ScanCounts(), 1000

@@ -17,7 +17,7 @@ from app.worker.protocol import Open, State, Status
 from app.worker.run import reflectance_of
 from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Pose3
 from pipeline.preprocessing import acquire, acquired_rows
 from pipeline.repairs.record import Repair
@@ -288,6 +288,16 @@ def test_pausing_while_seeking_stands_at_the_sought_scan() -> None:
     assert (session.status().state, session.status().scan_index) == ("paused", 80)
 
 
+def test_seeking_while_playing_goes_on_playing() -> None:
+    session = opened()
+    session.play()
+    session.seek(8.0)
+    settle(session)
+    assert session.status().state == "playing"
+    session.work()
+    assert session.status().scan_index == 81
+
+
 @pytest.mark.parametrize("time_s", [float("nan"), 1e300])
 def test_odd_times_do_no_harm(time_s: float) -> None:
     session = opened(4)
@@ -447,6 +457,21 @@ def test_preparing_leaves_no_trace() -> None:
     assert checksum(session) == played({}, 2)
 
 
+def test_preparing_maps_with_the_parameters_of_the_first_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[float] = []
+    process = FakeMapper.process
+
+    def remember(self: FakeMapper, step: Step) -> Frame:
+        used.append(self.parameters.clustering.eps)
+        return process(self, step)
+
+    monkeypatch.setattr(FakeMapper, "process", remember)
+    session = opened()
+    session.set_parameters(parameters(0.7), 1)
+    session.prepare()
+    assert used == [0.7]
+
+
 def test_a_source_without_a_scan_cannot_be_prepared() -> None:
     with pytest.raises(SourceError, match="no scan in it"):
         opened(0).prepare()
@@ -516,6 +541,16 @@ def test_a_robot_whose_scans_wait_is_not_called_silent_unless_it_is_paused(
     assert (told.silence_s, told.map_age_s, told.scans_lost) == (3.0, 7.0, 3)
 
 
+def test_a_source_without_a_mapper_is_closed() -> None:
+    def refuses(*_: object) -> Any:
+        raise StemmapError("the forest 'oak' does not exist")
+
+    source = FakeSource(3)
+    with pytest.raises(StemmapError, match="oak"):
+        Session(lambda *_: source, refuses, Parameters()).open(Open("fake:"))
+    assert source.closed
+
+
 TIE = Repair("tie", ((1.0, 0.0), (1.0, 0.0)), (0, 1))
 
 
@@ -582,3 +617,13 @@ def test_other_parameters_repair_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     session.set_parameters(parameters(0.5), 1)
     assert session.shown.frame is not None
     assert calls[0][0] is not calls[-1][0]
+
+
+def test_a_tie_acts_while_a_stored_scan_is_shown() -> None:
+    session = opened()
+    session.seek(12.0)
+    settle(session)
+    session.seek(1.0)
+    before = session.shown.is_stored
+    session.shown.set_repairs((TIE,))
+    assert (before, session.shown.is_stored) == (True, False)

@@ -391,3 +391,20 @@ async def test_a_command_that_is_not_answered_while_paused_replaces_the_worker()
         await said.opened()
     finally:
         await worker.close()
+
+
+@pytest.mark.slow
+async def test_a_run_that_is_paused_or_plays_slowly_is_not_replaced() -> None:
+    said = Said()
+    worker = WorkerProcess(FAKE, silence_limit_s=2.0)
+    await worker.start(said)
+    try:
+        await worker.send(SetSpeed(0.01))
+        await worker.send(Open("fake:30"))
+        await said.opened()
+        await worker.send(Play())
+        await said.state("playing")
+        await asyncio.sleep(3.0)
+        assert worker.restarts == 0
+    finally:
+        await worker.close()

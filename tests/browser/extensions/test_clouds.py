@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -192,6 +193,16 @@ def test_the_page_shows_the_numbers_of_the_files(page: Dashboard) -> None:
     assert [float(value) for value in places[1]] == [float(first["x_m"]), float(first["y_m"])]
 
 
+def test_the_colours_of_heights_have_numbers(page: Dashboard) -> None:
+    page.page.locator("#layers-button").click()
+    choice = page.page.locator("[data-choice=colour_by]")
+    choice.select_option("height")
+    ticks = page.page.locator("#colour-bar li")
+    expect(ticks).to_have_text([re.compile(r"^.?\d+\.\d m$")] * 2)
+    choice.select_option("verdict")
+    page.page.keyboard.press("Escape")
+
+
 def test_a_robot_drives_through_the_cloud_as_the_second_choice(page: Dashboard, cloud: Path) -> None:
     open_cloud(page, cloud, drive=True)
     page.until_server("/api/status", "it.source.startsWith('sim:cloud') && it.scan_index >= 0")
@@ -199,3 +210,34 @@ def test_a_robot_drives_through_the_cloud_as_the_second_choice(page: Dashboard, 
     expect(page.page.locator("[data-figure=health]")).to_be_visible()
     heads = page.page.locator("#trees thead th[data-key=height]")
     expect(heads).to_be_hidden()
+
+
+US_FT = 1200 / 3937  # m
+
+
+def test_a_cloud_in_feet_has_the_coordinates_of_its_files_and_says_their_unit(
+    page: Dashboard, tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(2)
+    points = np.concatenate([flat(10.0, rng), *(tree(x, y, rng, top) for x, y, top in PLACES)])
+    file = tmp_path / "feet.laz"
+    write_las(file, points / US_FT, offset=(2_800_000.0, 1_200_000.0, 5_000.0), crs="EPSG:6430+6360")
+    page.tab("Trees")
+    heads = page.page.locator("#trees thead th").filter(visible=True)
+    open_cloud(page, file)
+    page.until_server("/api/status", "it.source.endsWith('feet.laz') && it.state === 'finished'")
+    expect(heads.nth(1)).to_contain_text("x US ft")
+    expect(page.page.locator("#trees tbody tr")).to_have_count(len(PLACES))
+    with page.page.expect_download() as download:
+        page.page.locator("#trees-csv").click()
+    with Path(str(download.value.path())).open(newline="", encoding="utf-8") as written:
+        row = next(csv.DictReader(written))
+    cells = page.page.locator(f"#trees tr[data-tree='{row['tree']}'] td")
+    assert [cells.nth(k).inner_text() for k in (1, 2)] == [row["x"], row["y"]]
+    with page.page.expect_download() as download:
+        page.page.locator("#map-csv").click()
+    head, first, *_ = Path(str(download.value.path())).read_text(encoding="utf-8").splitlines()
+    assert head.split(",")[2:4] == ["x", "y"]
+    assert first.split(",")[2:4] == [row["x"], row["y"]]
+    page.page.locator(f"#trees tbody tr[data-tree='{row['tree']}']").click()
+    expect(page.page.locator("#panel-story")).to_contain_text(f"{row['x']}, {row['y']} US ft")

@@ -66,3 +66,16 @@ def test_a_typed_plot_has_the_coordinates_of_the_file(page: Dashboard) -> None:
     expect(rows.locator("td").nth(3)).to_have_text("509 ± 31")  # in full view: the counting error of 6 %
     page.page.locator("#plot-undo").click()
     expect(rows).to_have_count(0)
+
+
+def test_the_form_shows_that_the_coordinates_of_the_file_are_in_force(page: Dashboard) -> None:
+    panel = page.tab("Plots")
+    panel.locator("#coordinates summary").click()
+    panel.locator("#coordinates-crs").fill("EPSG:26912")
+    panel.locator("#coordinates-how").select_option("file")
+    panel.get_by_role("button", name="Apply").click()
+    expect(panel.locator("#coordinates-result")).to_contain_text("By the coordinates of the file")
+    expect(panel.locator("#coordinates-how")).to_have_value("file")
+    expect(panel.locator("#coordinates-hand")).to_be_hidden()
+    panel.locator("#coordinates-remove").click()
+    expect(panel.locator("#coordinates-remove")).to_be_disabled()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 
 from tests.browser.conftest import opened_by_another
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
+from tests.browser.test_accessibility import in_both_themes
 from tests.browser.test_annotate import place_of
 
 
@@ -144,6 +146,27 @@ def test_what_people_measured_is_stated_below_the_figures(person: Dashboard) -> 
     expect(review).to_have_text(re.compile(r"Review: 0 of \d+ found trees reviewed\.$"))
 
 
+# The text about corrected figures of the whole area, of two plots of which one was observed, and of two.
+CORRECTIONS = """async () => {
+  const { correctionText } = await import('/static/js/extensions/stand/panel.js');
+  const figures = { detection_sigma_m: 8, mean: { n_ha_corrected: [521, 79], g_ha_corrected: [30.1, 4.2] } };
+  const [seen, hidden] = [{ seen_m2: 100 }, { seen_m2: 0 }];
+  return [
+    correctionText({ ...figures, plots: { all: seen } }, true),
+    correctionText({ ...figures, plots: { north: seen, south: hidden } }, false),
+    correctionText({ ...figures, plots: { a: seen, b: seen } }, false),
+  ];
+}"""
+
+
+def test_corrected_figures_say_of_which_area_they_are(person: Dashboard) -> None:
+    said = [
+        re.findall("the corrected ones, (.*?) stems/ha", text) for text in person.page.evaluate(CORRECTIONS)
+    ]
+    places = ("the whole observed area", "plot north", "the mean of 2 plots")
+    assert said == [[f"of {place}: 521 ± 79"] for place in places]
+
+
 def test_the_heading_of_the_report_is_typed_once(person: Dashboard) -> None:
     page = person.page
     fields = page.locator("#report-heading input")
@@ -161,6 +184,42 @@ def test_the_heading_of_the_report_is_typed_once(person: Dashboard) -> None:
     expect(fields.nth(2)).to_have_value("")
     page.locator("#plot-undo").click()
     expect(fields.nth(0)).to_have_value("")
+
+
+def test_names_of_the_heading_stay_while_others_are_stored_and_after_a_refusal(person: Dashboard) -> None:
+    page = person.page
+    fields = page.locator("#report-heading input")
+    sent: list[Route] = []
+    page.route("**/api/heading", lambda route: sent.append(route))
+    for row, name in enumerate(("Hohe Warte", "the town")):
+        fields.nth(row).fill(name)
+        fields.nth(row).press("Tab")
+    person.eventually(lambda: len(sent) == 1, lambda: sent)
+    sent[0].continue_()
+    person.eventually(lambda: len(sent) == 2, lambda: sent)  # the first edit has come back
+    names = [json.loads(route.request.post_data or "")["names"] for route in sent]
+    assert names == [{"stand": "Hohe Warte"}, {"client": "the town"}]
+    expect(fields.nth(1)).to_have_value("the town")
+    refusal = {"error": {"what": "the names are refused", "where": "", "remedy": ""}}
+    sent[1].fulfill(status=422, json=refusal)
+    expect(page.locator("#plots-error")).to_have_text("The names are refused.")
+    expect(fields.nth(1)).to_have_attribute("aria-invalid", "true")
+    expect(fields.nth(1)).to_have_value("the town")
+    page.unroute("**/api/heading")
+    fields.nth(2).fill("Ann")
+    fields.nth(2).press("Tab")
+    person.until_server("/api/annotations", "it.others.heading?.[0].author === 'Ann'")
+    expect(fields.nth(1)).to_have_value("the town")
+    fields.nth(1).fill("the city")
+    fields.nth(1).press("Tab")
+    person.until_server("/api/annotations", "it.others.heading?.[0].client === 'the city'")
+    expect(fields.nth(1)).to_have_attribute("aria-invalid", "false")
+    assert person.ask("/api/annotations")["others"]["heading"][0]["stand"] == "Hohe Warte"
+    for _ in range(3):
+        page.locator("#plot-undo").click()
+    person.until_server("/api/annotations", "!it.others.heading?.length")
+    expect(fields.nth(1)).to_have_value("")
+    person.errors.clear()  # the browser logs an answer that refuses
 
 
 def test_another_run_begins_with_empty_fields(person: Dashboard) -> None:
@@ -199,3 +258,12 @@ def test_viewers_see_plots_and_cannot_change_them(
         assert viewer.page.locator("#plots-edit").evaluate("node => node.inert")
     page.locator("#plot-undo").click()
     expect(rows).to_have_count(0)
+
+
+def test_a_plot_in_the_list_has_no_violation_and_no_text_that_cannot_be_read(person: Dashboard) -> None:
+    page = person.page
+    page.emulate_media(reduced_motion="reduce")  # colours change at once
+    page.get_by_text("Type a plot").click()
+    page.locator(".plot-form").first.get_by_role("button", name="Add").click()
+    expect(page.locator("#plots-table tr[data-plot]")).to_have_count(1)
+    assert in_both_themes(page, "#panel-plots") == []

@@ -165,6 +165,16 @@ def test_whole_numbers_in_floats_are_millimetres(tmp_path, points):
     np.testing.assert_allclose(found, points, atol=1e-3)
 
 
+def test_integer_coordinates_of_a_pcd(tmp_path, points):
+    head = (
+        f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE I I I\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
+        f"POINTS {len(points)}\nDATA binary\n"
+    )
+    (tmp_path / "c.pcd").write_bytes(head.encode() + np.rint(1000.0 * points).astype("<i4").tobytes())
+    found, _ = read(tmp_path / "c.pcd", form="cloud")
+    np.testing.assert_allclose(found, points, atol=1e-3)
+
+
 def test_an_extent_of_millimetres_only(tmp_path, points):
     wide = points * np.array([2.0, 2.0, 3.0])  # 30 x 30 x 30 m
     found, about = read(ply(tmp_path / "c.ply", 1000.0 * wide + 0.25, "double"))

@@ -181,6 +181,13 @@ def test_points_that_the_file_withholds_are_left_out_and_counted(tmp_path, point
     assert cloud.losses == {"points that have no coordinates, or that the file withholds": 100}
 
 
+def test_a_file_that_is_not_there_or_is_something_else(tmp_path, capsys):
+    (tmp_path / "text.laz").write_text("no points")
+    for name in ("text.laz", "nothing.laz"):
+        assert main(["map", str(tmp_path / name), "--out", str(tmp_path / "out")]) == 1
+        assert capsys.readouterr().err.count("\n") == 1
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "forest" / "pine_plot.laz").exists(), reason="there is no real data")
 def test_real_plots(tmp_path, capsys):

@@ -180,6 +180,14 @@ def test_the_report_lists_what_people_state(run, tmp_path, capsys):
     assert "Von Hand: Durchmesser mit Maßband: 2, Bäume ergänzt: 2, Bäume verworfen: 2" in german
 
 
+def test_tables_have_the_numbers(run, tmp_path, capsys):
+    with reviewed_run(run, STATED) as folder:
+        stemmap(capsys, "stand", folder, "--out", tmp_path)
+    header, row = (line.split(",") for line in (tmp_path / "stand.csv").read_text().splitlines())
+    of = dict(zip(header, row, strict=True))
+    assert [of[name] for name in ("dbh_by_tape", "trees_added", "trees_removed")] == ["2", "2", "2"]
+
+
 @pytest.mark.parametrize(
     ("against", "words"),
     [("both", "ground truth of the run with the annotations of people")],

@@ -179,6 +179,10 @@ def test_an_unknown_reference_system_is_named(run, tmp_path, capsys):
         result.refused(1, "does not know the reference system of georeference.json")
 
 
+def test_a_projected_system_with_heights_is_projected():
+    assert projected("EPSG:5555") == "EPSG:5555"
+
+
 def test_axes_are_east_and_north_as_in_pyproj_for_every_kind_of_system():
     for code, lon, lat in ((25832, 9.5, 48.0), (31467, 9.5, 48.0), (2193, 174.0, -41.0), (3067, 27.0, 62.0)):
         crs = projected(f"EPSG:{code}")

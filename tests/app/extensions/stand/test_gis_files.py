@@ -324,6 +324,19 @@ def test_the_terrain_is_a_raster_in_its_place(runs, tmp_path, capsys, name):
     assert np.isfinite(band).sum() == pytest.approx(1600, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("to", "code", "message"),
+    [
+        ("trees.kml", 1, ".gpkg, .shp"),
+        ("missing/trees.gpkg", 1, "cannot read or write"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(runs, capsys, tmp_path, monkeypatch, to, code, message):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, "export", runs["local"], "--to", to).refused(code, message)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(("suffix", "package"), [("xlsx", "xlsxwriter")])
 def test_a_missing_package_is_named_with_its_extra(runs, capsys, tmp_path, monkeypatch, suffix, package):
     monkeypatch.setitem(sys.modules, package, None)

@@ -7,6 +7,7 @@ import base64
 import json
 import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import geopandas
@@ -14,6 +15,7 @@ import httpx
 import numpy as np
 import pytest
 import shapely
+from msgspec import structs
 
 from app.dashboard.dashboard import Dashboard
 from app.worker.protocol import View
@@ -58,6 +60,23 @@ async def test_a_rejected_tree_is_marked_in_the_table_and_counts_in_no_figure(bo
     assert [row.rsplit(",", 1)[1] for row in rows] == ["rejected", *["open"] * (len(rows) - 1)]
     features = (await client.get("/api/export/geojson")).json()["features"]
     assert len(features) == len(rows) - 1
+
+
+@pytest.mark.slow
+async def test_the_way_of_coverage_is_that_of_the_child_process(both, monkeypatch) -> None:
+    client, dashboard = both
+    await look(dashboard)
+    shown = dashboard.shown
+    assert shown is not None
+    trees = shown.frame.trees
+    lacking = replace(trees, dbh=np.full_like(trees.dbh, np.nan), sides=np.ones(len(trees.number), np.int64))
+    dashboard.shown = structs.replace(shown, frame=replace(shown.frame, trees=lacking))
+    way = (await client.get("/api/detour")).json()
+    assert way["length_m"] > 0.0
+    assert set(way["trees"]) <= set(trees.number.tolist())
+    assert len(way["points"][0]) == 2
+    dashboard.shown = structs.replace(shown, frame=replace(shown.frame, trees=replace(lacking, sides=None)))
+    assert (await client.get("/api/detour")).json() == {}
 
 
 async def test_the_radius_of_a_circle_is_changed_and_no_other_shape_has_one(both) -> None:

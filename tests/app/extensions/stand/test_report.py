@@ -8,6 +8,7 @@ import math
 import os
 import re
 import tomllib
+from dataclasses import asdict
 from html.parser import HTMLParser
 from importlib.resources import files
 from pathlib import Path
@@ -20,10 +21,13 @@ from app.batch.run_folder import recorded_time
 from app.extensions.stand.figures import Estimate
 from app.extensions.stand.parameters import Stand
 from app.extensions.stand.report import Numbers, _digits, find_browser
-from pipeline.config.model import stage_specs
-from pipeline.types.records import Verdict
+from pipeline.config import Parameters
+from pipeline.config.model import field_specs, stage_specs
+from pipeline.evaluation import evaluate
+from pipeline.types.records import TruthTrees, Verdict
 from tests.app.batch.finished_runs import grid_run, write_run
 from tests.app.cli.test_commands import stemmap
+from tests.pipeline.strategies import trees
 
 
 class Page(HTMLParser):
@@ -157,6 +161,26 @@ def test_warnings_are_in_german(tmp_path, capsys, dbh, words, german):
     assert "auf Englisch" not in " ".join(shown)
 
 
+def test_parameters_have_titles_and_units(tmp_path, capsys):
+    folder = grid_run(tmp_path / "run")
+    file = folder / "run.json"
+    changed = {"clustering.eps": 0.3, "shape.fit": True, "no.longer": 2}
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"changed": changed}))
+    words = ["--volume", "0.001*dbh_cm^2", "--dbh-min", "0.075"]
+    shown = " ".join(Page(page_of(capsys, folder, tmp_path / "d.html", [*words, "--language", "de"])).texts)
+    assert "dbh_min" not in shown
+    assert "Kluppschwelle: 7,5 cm" in shown
+    assert (
+        "Kluppschwelle: 0,075 m; Gemeinsamer BHD-Fehler: 0,005 m; Zählfehler: 0,06; Klassenbreite: 0,04 m; "
+        in shown
+    )
+    assert "Stärkste Bäume: 100 1/ha" in shown
+    assert "Korrektur: halbnormal; Volumenformel: 0.001*dbh_cm^2" in shown
+    spec = next(spec for spec in field_specs() if spec.name == "clustering.eps")
+    assert f"{spec.title} (clustering.eps): 0,3 m" in " ".join(shown.split())
+    assert "(no.longer): 2" in shown
+
+
 def test_dates_pages_units_and_zeros(run, tmp_path, capsys):
     os.utime(run / "run.json", (1714732872, 1714732872))  # noon in Europe
     text = page_of(capsys, run, tmp_path / "r.html", ["--date", "2024-06-01"])
@@ -235,6 +259,21 @@ def test_a_report_has_mean_heights_and_their_number_of_trees(run, tmp_path, caps
     titles, cells = (re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in (head, row))
     assert len(titles) == len(cells)
     assert cells[titles.index("hL m")].startswith("21,4")
+
+
+def test_plots_have_their_dominant_diameter(tmp_path, capsys):
+    run = grid_run(tmp_path / "run")
+    rows = (run / "trees.csv").read_text().splitlines()
+    column = rows[0].split(",").index("dbh_cm")
+    for number, dbh in ((45, "61.5"), (56, "52.5")):  # both in the plot
+        cells = rows[number].split(",")
+        rows[number] = ",".join((*cells[:column], dbh, *cells[column + 1 :]))
+    (run / "trees.csv").write_text("\n".join(rows) + "\n")
+    text = page_of(capsys, run, tmp_path / "r.html", ["--rectangle", "10,10,10,10", "--language", "de"])
+    head, row = re.findall(r"<tr>(<t[hd]>(?:Fläche|1)<.*)</tr>", text)[:2]
+    titles, cells = (re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in (head, row))
+    assert len(titles) == len(cells)
+    assert cells[titles.index("do cm")] == "61,5"  # one tree on 100 m2
 
 
 def test_the_same_run_gives_the_same_page(run, tmp_path, capsys):
@@ -344,3 +383,13 @@ def test_heights_and_residuals_are_listed_where_there_are_any(run, tmp_path, cap
     stemmap(capsys, "georeference", run, "--control", points, "--crs", "EPSG:25832")
     shown = Page(page_of(capsys, run, tmp_path / "full.html")).texts
     assert {"Height m", "21.40", "0.30", "1: \N{MINUS SIGN}1.0, 0.0; 2: 1.0, 0.0"} <= set(shown)
+
+
+def test_references_that_do_not_count_are_named(tmp_path, capsys):
+    run = grid_run(tmp_path / "run")
+    record = json.loads((run / "run.json").read_text())
+    near = np.zeros((1, 2))
+    truth = TruthTrees(np.array([1.0, 30.0]), np.zeros(2), np.full(2, 0.3), ("tree", "tree"))
+    record["evaluation"] = asdict(evaluate(trees(np.zeros((1, 2))), truth, Parameters().evaluation, near))
+    (run / "run.json").write_text(json.dumps(record))
+    assert "that do not count, too far from the path (10 m)" in page_of(capsys, run, tmp_path / "a.html")

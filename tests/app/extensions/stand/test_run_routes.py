@@ -71,6 +71,25 @@ async def test_two_visits_are_those_of_the_command(
     np.testing.assert_allclose(told["places_b"]["6"], there[5], atol=0.02)
 
 
+@pytest.mark.slow
+async def test_maps_that_do_not_fit_are_compared_without_alignment(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    write_run(folder / "few", [[1.0, 1.0]], [0.2])
+    write_run(folder / "none", np.zeros((0, 2)), [])
+    write_run(folder / "other", [[1.3, 1.0], [9.0, 9.0]], [0.2, 0.3])
+    for k, name in enumerate(("few", "none", "other")):
+        run = folder / name / "run.json"
+        run.write_text(run.read_text().replace('"sha256": "00"', f'"sha256": "{k}"'))
+    async with running(Settings(folder=tmp_path)) as (client, _):
+        client.headers.update(BEARER)
+        for a, b, statuses in (("few", "other", ["same", "new"]), ("none", "few", ["new"])):
+            query = {"a": f"folder:{a}", "b": f"folder:{b}"}
+            told = (await client.get("/api/runs/compare", params=query)).json()
+            assert told["how"].startswith("not aligned: the stems of the two maps do not agree")
+            assert not told["aligned"]
+            assert [row["status"] for row in told["rows"]] == statuses
+
+
 @pytest.mark.parametrize("key", ["99", "folder:nothing"])
 async def test_a_run_that_is_not_there_is_not_compared(both: Running, key: str) -> None:
     client, _ = both

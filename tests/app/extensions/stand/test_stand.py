@@ -101,6 +101,16 @@ def test_points_without_a_place_or_a_radius_are_refused(run, tmp_path, capsys, p
     stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local").refused(1, message)
 
 
+def test_a_file_of_features_that_is_not_one_json_value_is_refused(run, tmp_path, capsys):
+    feature = {
+        "type": "Feature",
+        "properties": {},
+        "geometry": shapely.geometry.mapping(shapely.box(0, 0, 9, 9)),
+    }
+    (file := tmp_path / "p.geojson").write_text(2 * (json.dumps(feature) + "\n"))
+    stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local").refused(1, "not JSON in UTF-8")
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [(["--circle", "500,500,5"], "outside of what the run observed"), (["--circle", "10,10,0"], "area of 0")],
