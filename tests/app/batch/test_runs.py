@@ -212,7 +212,7 @@ async def test_rename_delete_and_undo(both: Running) -> None:
     assert {each["name"] for each in await runs(client)} == {"north stand", "other:"}
 
 
-@pytest.mark.parametrize("key", ["99", "folder:nothing", "99999999999999999999"])
+@pytest.mark.parametrize("key", ["99", "nothing", "folder:nothing", "-1", "99999999999999999999"])
 async def test_a_run_that_is_not_there(both: Running, key: str) -> None:
     client, _ = both
     assert (await client.get(f"/api/runs/{key}")).status_code == 404
@@ -272,7 +272,7 @@ async def test_a_run_is_played_again_with_its_topics_and_mounting(both: Running)
     assert asked[-3:] == [chosen, Open("other:"), chosen]
 
 
-@pytest.mark.parametrize("kept", [None, {"topics": {"lidar": "/x"}}, {"mount": ["a"] * 6}])
+@pytest.mark.parametrize("kept", [None, 7, {"topics": {"lidar": "/x"}}, {"mount": [1]}, {"mount": ["a"] * 6}])
 def test_damaged_choices_are_left_out(kept: object):
     request = request_of_kept("fake:", odometry="auto", seed=3, choices=kept)
     assert request == SourceRequest("fake:", seed=3)

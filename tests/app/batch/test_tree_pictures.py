@@ -139,7 +139,12 @@ def bomb() -> bytes:
 
 @pytest.mark.parametrize(
     "picture",
-    [drawing(b"\xff\xd8\xff\xe0 no picture"), drawing(bomb()), drawing(bytes(32), "rgb8", 4000, 4000, 12000)],
+    [
+        drawing(b"\xff\xd8\xff\xe0 no picture"),
+        drawing(bomb()),
+        drawing(bytes(32), "16UC1", 4, 4, 8),
+        drawing(bytes(32), "rgb8", 4000, 4000, 12000),
+    ],
 )
 def test_what_is_no_picture_is_refused(picture: Drawing):
     with pytest.raises(Exception, match=r".+"):

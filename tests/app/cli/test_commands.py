@@ -512,6 +512,17 @@ def test_standing_still_is_warned_of(tmp_path, capsys):
     assert json.loads((tmp_path / "run.json").read_text())["odometry"] == "static"
 
 
+def test_presets_and_values_are_taken(tmp_path, capsys):
+    told = stemmap(
+        capsys, "map", RUN, "--out", tmp_path, "--preset", "paper", "--set", "slam.particles=5", "--seed", "3"
+    )
+    assert told.code == 0
+    record = json.loads((tmp_path / "run.json").read_text())
+    assert (record["preset"], record["seed"]) == ("paper", 3)
+    assert record["parameters"]["slam"]["particles"] == 5
+    assert record["parameters"]["clustering"]["eps"] == 0.25
+
+
 @pytest.mark.parametrize("library", ["json", "zenoh"])
 def test_the_program_ends_with_the_code_and_all_it_said(tmp_path, library):
     pytest.importorskip(library)

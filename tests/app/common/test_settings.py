@@ -58,13 +58,16 @@ def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str],
 @pytest.mark.parametrize(
     ("name", "value"),
     [
+        ("STEMMAP_HOST", "0.0.0.0"),  # noqa: S104
         ("STEMMAP_HOST", "example.org"),
         ("STEMMAP_PORT", "80000"),
         ("STEMMAP_PORT", "http"),
         ("STEMMAP_UPLOAD_GB", "nan"),
         ("STEMMAP_RUN_GB", "0"),
+        ("STEMMAP_RUN_MEMORY_MB", "much"),
         ("STEMMAP_TOKEN", "short"),
         ("STEMMAP_TOKEN", "with a\nline break in it"),
+        ("STEMMAP_TOKEN", "öööööööööööööööööö"),
         ("STEMMAP_RECORDINGS", "/no/such/folder"),
         ("STEMMAP_FILES", "all"),
     ],
@@ -76,7 +79,14 @@ def test_what_cannot_be_used_names_the_variable(name: str, value: str) -> None:
 
 @pytest.mark.parametrize(
     ("host", "loopback"),
-    [("127.5.5.5", True), ("::1", True), ("localhost", True), ("::", False), ("host", False)],
+    [
+        ("127.0.0.1", True),
+        ("127.5.5.5", True),
+        ("::1", True),
+        ("localhost", True),
+        ("::", False),
+        ("host", False),
+    ],
 )
 def test_loopback(host: str, loopback: bool) -> None:
     assert is_loopback(host) is loopback

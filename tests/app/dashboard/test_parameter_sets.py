@@ -55,7 +55,7 @@ async def test_a_set_that_has_the_name_makes_room(both: Running) -> None:
     assert dashboard.sets.name_of("forest", dashboard.parameters.parameters) == "", "that of the preset"
 
 
-@pytest.mark.parametrize("name", ["", "../x", "x" * 41, "a\x1b[2J", "forest"])
+@pytest.mark.parametrize("name", ["", "../x", "-flag", "x" * 41, "a\x1b[2J", "forest"])
 async def test_a_name_that_is_none_is_refused(both: Running, name: str) -> None:
     client, _ = both
     assert (await client.post("/api/sets", json={"name": name})).status_code == 422
@@ -64,7 +64,7 @@ async def test_a_name_that_is_none_is_refused(both: Running, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("[clustering", "not a TOML file"), ("[clustering]\neps = 9\n", "eps")],
+    [("[clustering", "not a TOML file"), ("[clustering]\neps = 9\n", "eps"), ("[best]\nx = 1\n", "best")],
 )
 async def test_a_file_that_does_not_fit_changes_nothing(both: Running, text: str, words: str) -> None:
     client, dashboard = both

@@ -49,6 +49,7 @@ def test_a_sensor_has_a_place_and_a_sender():
         "velodyne:0.0.0.0:2368?from=lidar",
         "zenoh:",
         "zenoh:tcp/host:0",
+        "zenoh:tcp/host:70000",
         "zenoh:udp/host:7447",
         'zenoh:tcp/h:7447",x',
         "zenoh:tcp/host:7447?colour=red",

@@ -80,7 +80,7 @@ def test_a_port_in_use_is_said(drive: Path, router: int):
         send(drive, router)
 
 
-@pytest.mark.parametrize("port", ["65536", "any"])
+@pytest.mark.parametrize("port", ["0", "65536", "any"])
 def test_a_port_that_no_address_can_name_is_wrong_usage(port: str, capsys: pytest.CaptureFixture[str]):
     assert main(["send", "sim:paper?duration=1", "--port", port]) == WRONG_USAGE
     assert "a whole number from 1 to 65535" in capsys.readouterr().err

@@ -65,7 +65,7 @@ async def test_a_recording_tells_its_topics_and_where_the_lidar_stands(both: Run
     assert (missing.status_code, missing.json()["error"]["where"]) == (409, "/no/such.mcap")
 
 
-@pytest.mark.parametrize("path", ["/no/such.mcap", "a" * 4000, "x\0.mcap"])
+@pytest.mark.parametrize("path", ["/no/such.mcap", "~nobody9/x.mcap", "a" * 4000, "x\0.mcap"])
 async def test_a_path_that_does_not_exist_is_refused_without_a_process(
     both: Running, path: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -173,6 +173,7 @@ async def test_the_choice_goes_to_the_worker(both: Running) -> None:
     [
         {"topics": {"lidar": "/points"}},
         {"topics": {"scan": "x" * 300}},
+        {"mount": [0, 0, 1, 0, 0, 400]},
         {"mount": [0, 0, "NaN", 0, 0, 0]},
         {"mount": [500, 0, 0, 0, 0, 0]},
     ],
@@ -233,7 +234,7 @@ async def test_a_whole_cloud_is_checked_without_a_drive_through_it(tmp_path: Pat
 
 @pytest.mark.parametrize(
     "changes",
-    [{"scans": "many"}, {"scans": math.inf}, {"health": []}],
+    [{"scans": "many"}, {"scans": math.inf}, {"health": []}, {"health": {"scans": 3}}],
 )
 def test_a_damaged_record_of_a_run_is_named(tmp_path: Path, changes: dict[str, Any]) -> None:
     folder = grid_run(tmp_path / "run")

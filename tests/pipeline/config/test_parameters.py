@@ -226,6 +226,8 @@ def test_toml_may_omit_values_and_write_lengths_as_integers():
         "[clustering]\neps = " + 3000 * "[" + 3000 * "]",
         "a" + 25_000 * ".a" + " = 1",
         "[" + "a." * 25_000 + "a]",
+        "[[clustering]]\neps = 0.3",
+        "# " + 1_000_000 * "x",
     ],
     ids=lambda text: repr(text[:28]),
 )

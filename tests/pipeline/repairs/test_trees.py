@@ -145,11 +145,14 @@ def test_a_tie_names_only_trees_that_were_seen_in_scans_of_the_map():
         "{}",
         '{"repairs": [{"kind": "burn"}]}',
         '{"repairs": [{"kind": "delete", "places": [[1, NaN]]}]}',
+        '{"repairs": [{"kind": "delete", "places": [[1, 2]], "stamps_ns": [1]}]}',
         '{"repairs": [{"kind": "tie", "places": [[1, 2], [1, 2]], "stamps_ns": [1]}]}',
         '{"repairs": [{"kind": "class", "places": [[1, 2]], "value": "stone"}]}',
         '{"repairs": [{"kind": "delete", "places": [[1, 2]], "who": "me"}]}',
+        '{"repairs": [{"kind": "delete", "places": [[1, 1e9]]}]}',
         '{"repairs": [{"kind": "delete", "places": [[1, 1' + "0" * 400 + "]]}]}",
         '{"repairs": [{"kind": "forbid", "stamps_ns": [1, 1' + "0" * 30 + "]}]}",
+        '{"repairs": [{"kind": "forbid", "stamps_ns": [-1, 1]}]}',
     ],
 )
 def test_what_is_no_file_of_repairs_is_refused(text):

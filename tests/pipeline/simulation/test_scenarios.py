@@ -38,7 +38,10 @@ def test_every_option_is_taken_and_the_seed_of_the_uri_wins():
         ("sim:stand?sigma=0.3", "0 to 0.2"),
         ("sim:stand?duration=٣٠", "duration"),
         ("sim:stand?odometry=perfect", "good, normal, poor, slipping, exact"),
+        ("sim:stand?duration=0", "duration"),
+        ("sim:stand?duration=1e9", "1 to 3600"),
         ("sim:stand?trees=2001", "0 to 2000"),
+        ("sim:stand?drive=1001", "drive"),
         ("sim:paper?trees=8", "at most 7 trees"),
     ],
 )

@@ -321,6 +321,11 @@ def test_an_unclear_axis_is_exit_code_3_until_it_is_named(tmp_path, shared_data,
     assert "up: y, as requested" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("R", UP.values(), ids=UP)
+def test_turning_keeps_left_and_right(R):
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
 def test_the_choice_of_the_axis_counts(tmp_path, points):
     file = ply(tmp_path / "c.ply", points @ UP["y"], "float")
     np.testing.assert_allclose(read(file, up="z")[0], points @ UP["y"], atol=1e-4)

@@ -98,14 +98,16 @@ def damage(content: bytes, at: int, new: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("at", "new"),
     [
-        (96, struct.pack("<I", 1 << 31)),
-        (105, struct.pack("<H", 65535)),
-        (247, struct.pack("<Q", 1 << 62)),
-        (131, struct.pack("<d", float("nan"))),
-        (155, struct.pack("<d", 1e300)),
+        (96, struct.pack("<I", 1 << 31)),  # where the points begin
+        (100, struct.pack("<I", 1 << 31)),  # how many records before
+        (105, struct.pack("<H", 65535)),  # bytes of a point
+        (105, struct.pack("<H", 1)),
+        (247, struct.pack("<Q", 1 << 62)),  # how many points
+        (131, struct.pack("<d", float("nan"))),  # scale of x
+        (155, struct.pack("<d", 1e300)),  # offset of x
     ],
 )
-@pytest.mark.parametrize("name", ["plot.laz"])
+@pytest.mark.parametrize("name", ["plot.las", "plot.laz"])
 def test_a_header_that_lies_is_one_line_and_takes_no_memory(tmp_path, points, name, at, new, capsys):
     file = write_las(tmp_path / name, points[:5000])
     file.write_bytes(damage(file.read_bytes(), at, new))

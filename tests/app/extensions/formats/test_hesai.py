@@ -196,7 +196,11 @@ def test_damaged_packets_are_counted(tmp_path: Path, opened: Opened):
 
 @pytest.mark.parametrize(
     ("head", "name"),
-    [((1, 4, 0, 0, 128, 2), "Pandar128 or OT128"), ((9, 9, 0, 0, 7, 7), "7 ch")],
+    [
+        ((4, 3, 0, 0, 128, 2), "AT128"),
+        ((1, 4, 0, 0, 128, 2), "Pandar128 or OT128"),
+        ((9, 9, 0, 0, 7, 7), "7 ch"),
+    ],
 )
 def test_a_model_without_a_table_is_refused_with_its_driver(
     head: tuple[int, ...], name: str, tmp_path: Path, opened: Opened
@@ -212,6 +216,7 @@ def test_a_model_without_a_table_is_refused_with_its_driver(
     ("msgtype", "maker", "driver"),
     [
         ("rslidar_msgs/msg/RslidarScan", "RoboSense", "rslidar_sdk"),
+        ("rslidar_msg/msg/RslidarPacket", "RoboSense", "rslidar_sdk"),
         ("hesai_ros_driver/msg/UdpFrame", "Hesai", "hesai_ros_driver"),
     ],
 )

@@ -239,7 +239,9 @@ def test_a_real_recording_of_hesai_as_a_capture_has_the_same_scans(
     ("payload", "port", "name", "driver"),
     [
         (b"\x00" * 1300, 56301, "Livox", "livox_ros_driver2"),
+        (b"\x05\x00" * 700, 57000, "Livox", "livox_ros_driver2"),
         (b"\x55\xaa\x05\x0a" + bytes(1244), 2368, "RoboSense", "rslidar_sdk"),
+        (b"\x55\xaa\x05\x5a" + bytes(1244), 6699, "RoboSense", "rslidar_sdk"),
         (b"\xee\xff\x04\x03\x00\x00\x80\x02" + bytes(1110), 2368, "Hesai AT128", "hesai_ros_driver"),
     ],
 )

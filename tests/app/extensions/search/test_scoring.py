@@ -97,6 +97,7 @@ def test_truth_far_from_the_path_is_no_score():
     [
         (["none.mcap", "--param-grid", "slam.gate=2,3"], 1, "none.mcap"),
         ([RUN, "--param-grid", "filters.x_min=1", "--param-grid", "filters.x_max=-1"], 2, "none of 1 set"),
+        ([RUN, "--out", "x"], 2, "--param-grid"),
         ([RUN, "--truth", "a", "--truth", "b"], 2, "2 files of true trees for 1 run"),
     ],
     ids=str,

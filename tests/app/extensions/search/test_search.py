@@ -201,6 +201,8 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
     ("words", "code", "message"),
     [
         (["sim:stand?duration=1", "--truth", "{far}"], 1, "no ground truth is within"),
+        (["sim:stand?duration=1", "--truth", "{aside}"], 1, "has a mapped tree within"),
+        (["{room}"], 1, "has no true trees"),
         ([RUN, RUN], 2, "named twice"),
         (["zenoh:tcp/127.0.0.1:7447"], 2, "live run"),
         ([RUN, OTHER, "--truth", "{far}"], 2, "Name the run of each file"),

@@ -195,6 +195,7 @@ def test_a_real_survey_and_a_lidar_map_are_aligned_without_hints(shared_data, tm
     [
         ("x_m,y_m,dbh_cm\n", "no trees"),
         ("x_m,y_m,dbh_m\n1,2,30\n3,4,25\n", "median diameter is 27.5 m"),
+        ("x_m,y_m,dbh_cm\n1,2,0.3\n3,4,0.25\n", "dbh_cm"),
         ("x_m,y_m,dbh\n1,2,30\n", "unit"),
         ("x_m,y_m\n1,2\n3,4\n9,9\n", "do not agree"),
     ],

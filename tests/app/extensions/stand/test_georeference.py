@@ -97,6 +97,7 @@ def test_plots_of_the_country_are_moved_into_the_map(run, tmp_path, capsys):
         ("tree,easting,northing\n999,500000,5300000\n", "no tree 999"),
         ("tree,easting,northing\n1,500000,5300000\n2,500009,5300000\n", "contradict|times"),
         ("tree,easting,northing\n1,5300000,500000\n2,5300002,500000\n", "no place|longitude"),
+        ("tree,easting,northing\n1,nan,5300000\n", "not a number"),
         (f"name,tree,easting,northing\n{'n' * 61},1,500000,5300000\n", "more than 60 characters"),
     ],
 )
@@ -115,7 +116,9 @@ def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, mes
         (["--by-hand", "500000,5300000,0"], 2, "--crs is missing"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:1"], 1, "not a coordinate reference system"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4326"], 1, "degrees"),
+        (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4807"], 1, "the unit grad"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4978"], 1, "is geocentric"),
+        (["--by-hand", "500000,5300000,0", "--crs", "EPSG:5773"], 1, "has only heights"),
         (["--by-hand", "500000,5300000,0", "--crs", LOCAL_WKT], 1, "of the kind Engineering CRS"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:2263"], 1, "foot"),
         (["--by-hand", "50,5,0", "--crs", "EPSG:25832"], 1, "do not fit"),

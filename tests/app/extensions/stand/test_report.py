@@ -145,12 +145,19 @@ def test_the_german_report_has_no_english_words(tmp_path, capsys):
     ("dbh", "words", "german"),
     [
         ([0.2], [], "nur 1 Baum: die Kennwerte sind unsicher"),
+        ([0.2, 0.3], [], "nur 2 Bäume: die Kennwerte sind unsicher"),
+        ([0.2, math.nan], [], "ohne Durchmesser: 1 von 2 Bäumen"),
+        ([0.2, 0.3], ["--volume", "dbh_cm*height_m"], "Volumen von 0 von 2 Bäumen: die anderen haben keine"),
+        ([0.01] * 3, ["--dbh-min", "0"], "alle Durchmesser sind kleiner als 2 cm"),
         ([4.0], [], "ein Durchmesser ist größer als 3 m"),
+        ([0.2], ["--circle", "20,20,5"], "Probefläche 1: nur 25 % der Fläche wurden eingesehen"),
+        ([0.2], ["--circle", "1,1,1", "--circle", "9,9,1"], "Probefläche 2: die Fläche hat keine Bäume"),
         (
             [0.2],
             ["--circle", "1,1,1", "--circle", "99,9,1"],
             "Probefläche 2: kein Teil der Fläche wurde eingesehen",
         ),
+        ([0.2], ["--circle", "1,1,1", "--circle", "9,9,1"], "weniger als zehn Bäume in allen Probeflächen"),
     ],
 )
 def test_warnings_are_in_german(tmp_path, capsys, dbh, words, german):
