@@ -31,7 +31,8 @@ LONGEST_SILENCE_S = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """State of the processes after a number of scans: `own` is the memory without the pages of files."""
+    """State of the processes after a number of scans. Memory is the least of the part before it, as each
+    state that is stored takes 10 MB for a moment; `own` is without the pages of files."""
 
     scans: int
     web_mib: float
@@ -68,12 +69,16 @@ def follow(server: Side, browser: Side) -> list[Reading]:
         StemmapError: No scan was mapped for LONGEST_SILENCE_S, or the drive ended before SCANS.
     """
     readings: list[Reading] = []
+    samples: list[tuple[float, ...]] = []  # of the memory in this part
     pids, heard_at, last = server.ask({"do": "pids"}), time.monotonic(), -1
     while len(readings) <= READINGS:
         time.sleep(1.0)
         status = browser.ask({"do": "status"})
         server.ask({"do": "heard"})  # or their lists would grow
         browser.ask({"do": "heard"})
+        samples.append(
+            tuple(read(pids[name]) for read in (resident_mib, anonymous_mib) for name in ("web", "worker"))
+        )
         now = status["scan_index"] + 1
         if now != last:
             heard_at, last = time.monotonic(), now
@@ -85,19 +90,21 @@ def follow(server: Side, browser: Side) -> list[Reading]:
             )
         if now >= max(1, len(readings) * SCANS // READINGS) or status["state"] == "finished":
             cpu = server.ask({"do": "cpu"})
+            web, worker, web_own, worker_own = map(min, zip(*samples, strict=True))
             readings.append(
                 Reading(
                     now,
-                    resident_mib(pids["web"]),
-                    resident_mib(pids["worker"]),
-                    anonymous_mib(pids["web"]),
-                    anonymous_mib(pids["worker"]),
+                    web,
+                    worker,
+                    web_own,
+                    worker_own,
                     cpu["web"],
                     cpu["worker"],
                     _unnamed_files_mib(pids["worker"]),
                     status["trees"],
                 )
             )
+            samples.clear()
             print(readings[-1], flush=True)
     return readings
 
@@ -152,7 +159,7 @@ def _table(readings: list[Reading]) -> Table:
             f"Required: within {100 * MOST_SLOWER:.0f} %: {verdict(end <= (1 + MOST_SLOWER) * start)}.",
             "The lap is simulated once; its scans return, its wheels drift on, and the robot stands for 20 s "
             "after every fifth lap. Times are CPU times for a scan, with storage of steps and frames and "
-            "pictures for the browser. Files: temporary files of the worker.",
+            "pictures for the browser. Files: temporary files of the worker. Memory: the least of each part.",
             f"Load of the machine at the end: {os.getloadavg()[0]:.1f}.",
         ),
     )
