@@ -1012,7 +1012,7 @@ def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
         other.tab("Annotate")
         theirs = other.page.locator("#annotations tbody tr")
         expect(theirs).to_have_count(2)
-        expect(theirs.first).to_contain_text("Ann")
+        expect(theirs.first).to_contain_text("import of plot.csv")
         # The other one begins to type; meanwhile Ann changes the same.
         field = theirs.first.get_by_label(re.compile("DBH"))
         field.focus()
