@@ -7,7 +7,7 @@ import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js
 import { select } from "../core/live_feed.js";
 import { distance } from "../core/nearest.js";
 import { showDone, showNews, showProblem } from "../core/problem.js";
-import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
+import { isDrive, on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { historyKey } from "../core/undo_keys.js";
 import { saveWritten } from "../core/written_file.js";
@@ -247,7 +247,7 @@ function hint(tree) {
   const chosen = rowOf(draft.chosen);
   if (chosen && treeNumberOf(chosen) === null) return `Your annotation (${chosen.kind}) belongs to no found tree: Y, N and the keys of the classes set its class, arrows move it, Del deletes it.`;
   if (imported) return imported;
-  if (tree) return `Tree ${tree.number}, ${seenText(tree)}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?${besideHint(tree)}`;
+  if (tree) return `Tree ${tree.number}, ${isDrive() ? seenText(tree) : `fitted in ${count(tree.observations, "slice")}`}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?${besideHint(tree)}`;
   if (trees().length && !unreviewed().length) return `${trees().length === 1 ? "The tree is" : `All ${trees().length} trees are`} reviewed. ${truthText()}`;
   if (!rows().length) return "Press Next to review the trees one by one, or Add and click on the map where a tree was missed (Shift+click in the 3D scene).";
   return truthText();

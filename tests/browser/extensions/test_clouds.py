@@ -134,6 +134,7 @@ def test_the_card_of_a_tree_shows_all_cross_sections(page: Dashboard) -> None:
     page.card_shown()
     evidence = page.page.locator("#review-evidence")
     expect(evidence.get_by_text("9 cross-sections")).to_be_in_viewport(ratio=1)
+    expect(page.page.get_by_text(re.compile(r"^Tree \d+, fitted in \d+ slices"))).to_be_visible()
     sections = evidence.locator(".section")
     expect(sections).to_have_count(9)
     for k in range(9):
