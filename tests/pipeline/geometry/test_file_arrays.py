@@ -65,6 +65,11 @@ def test_they_are_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> N
     assert array.sum() == 2 * LEAST
 
 
+def test_they_leave_room_on_the_disk_for_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.geometry.file_arrays.SPARE_BYTES", 1 << 62)
+    assert empty((LEAST,), np.dtype(np.float64)).base is None
+
+
 def test_another_thread_sees_no_row_before_it_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
     table, seen = GrowingColumns(np.arange(4)), list[list[int]]()
 
