@@ -245,16 +245,17 @@ def truth_in_metres(
     nearer to its points.
 
     Args:
-        truth: True trees in the coordinates of the file or in metres.
+        truth: True trees in the coordinates of the file or in metres; unknown ones (NaN) are not compared.
         unit: Metres per unit of the reference system, see `crs_unit`.
         near: A position in the file, x, y [m].
     """
-    if unit == (1.0, 1.0) or not len(truth.x):
+    known = np.isfinite(truth.x) & np.isfinite(truth.y)
+    if unit == (1.0, 1.0) or not known.any():
         return truth
     scaled = replace(truth, x=truth.x * unit[0], y=truth.y * unit[0])
     return min(
         (truth, scaled),
-        key=lambda each: math.hypot(np.median(each.x) - near[0], np.median(each.y) - near[1]),
+        key=lambda each: math.hypot(np.median(each.x[known]) - near[0], np.median(each.y[known]) - near[1]),
     )
 
 

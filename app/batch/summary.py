@@ -15,7 +15,7 @@ from pipeline.config import Parameters
 from pipeline.evaluation import MapScores, PathError, Rate
 from pipeline.geometry.columns import rows_of
 from pipeline.geometry.poses import Float
-from pipeline.io.readers import packet_formats
+from pipeline.io.readers import MessageFormat, added
 from pipeline.map_faults import DOUBTFUL
 from pipeline.odometry.synchroniser import JUMP_SPEED, PAUSE_NS
 from pipeline.types.records import Frame, Health, HealthState, Int, Path, Verdict
@@ -475,7 +475,7 @@ def unread_scans(topics: Iterable[RecordedTopic]) -> list[str]:
     frames = {topic.frame for topic in read} - {""}
     is_planar = any(topic.type.endswith("/LaserScan") for topic in read)
     # Packets are those of a LiDAR whose clouds are read, except beside a planar one.
-    kinds = [kind for kind in packet_formats() if kind.sweeps is not None or kind.recording is not None]
+    kinds = [kind for kind in added(MessageFormat) if kind.sweeps is not None or kind.recording is not None]
     packets = {name for kind in kinds for name in kind.msgtypes}
     usable = {name for kind in kinds if not kind.refusal for name in kind.msgtypes}
     unread = [

@@ -75,10 +75,10 @@ class GrowingColumns:
         end, capacity = start + len(rows[0]), len(self._columns[0])
         if start < self._rows_shared or end > capacity:
             capacity = 2 * end if end > capacity else capacity
-            before, self._rows_shared = self._columns, 0
-            self._columns = [empty((capacity, *column.shape[1:]), column.dtype) for column in before]
-            for column, old in zip(self._columns, before, strict=True):
+            larger = [empty((capacity, *column.shape[1:]), column.dtype) for column in self._columns]
+            for column, old in zip(larger, self._columns, strict=True):
                 column[: len(old)] = old
+            self._columns, self._rows_shared = larger, 0  # only now: another thread may read
         for column, new in zip(self._columns, rows, strict=True):
             column[start:end] = new
         self._length = end

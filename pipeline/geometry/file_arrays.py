@@ -17,6 +17,7 @@ _DISK = Path("/var/tmp")  # noqa: S108 - the default may be in memory; the files
 #: Folder of large temporary files; None for that of the system.
 LARGE = _DISK if _DISK.is_dir() else None
 LEAST = 1 << 16  # bytes; smaller arrays are in memory
+SPARE_BYTES = 2 << 30  # of the disk are left to recordings and to other programs
 
 
 def unnamed_file() -> Any:  # noqa: ANN401 - its class depends on the operating system
@@ -32,7 +33,8 @@ def unnamed_file() -> Any:  # noqa: ANN401 - its class depends on the operating 
 
 def empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return an array like `np.empty`. From LEAST bytes on it is in a file without a name, which is deleted
-    with the array, if the disk has room for all of it. A forked process shares its values."""
+    with the array, if the disk has room for all of it and SPARE_BYTES. A forked process shares its
+    values."""
     size = math.prod(shape) * dtype.itemsize
     reserve = getattr(os, "posix_fallocate", None)  # else a full disk would end the process
     file = unnamed_file() if size >= LEAST and reserve is not None else None
@@ -40,6 +42,9 @@ def empty(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
         return np.empty(shape, dtype)
     with file:
         try:
+            disk = os.fstatvfs(file.fileno())
+            if disk.f_bavail * disk.f_frsize < size + SPARE_BYTES:
+                return np.empty(shape, dtype)
             reserve(file.fileno(), 0, size)
             pages = mmap.mmap(file.fileno(), size)
         except OSError:

@@ -12,14 +12,13 @@ from typing import Any, TypeVar
 
 import zstandard
 
-from pipeline.geometry.file_arrays import LARGE, unnamed_file
+from pipeline.geometry.file_arrays import LARGE, SPARE_BYTES, unnamed_file
 
 B = TypeVar("B")
 
 MOST_BYTES = 4 << 30  # of one file
 LARGEST = 1 << 28  # bytes of a block before compression; the largest known clouds need a fiftieth
 _LEVEL = 1  # of the compression; higher levels take longer and save one percent
-SPARE_BYTES = 2 << 30  # of the disk are left to recordings and to other programs
 BLOCKS_BETWEEN_CHECKS = 50  # of the free space of the disk
 DAMAGED = "a temporary file is damaged: {} parts are intact, the others are processed again"
 

@@ -292,8 +292,8 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
 
 def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:
     """Return the trees of all scans: first one for each voxel column with the verdict TREE, then each group
-    of clusters (`ClusterTable.places`) that its hits confirm, and without a column within REACH. The
-    hits of a group are its clusters times `spacing`. The tree of a column has position and hits of the
+    of clusters (`ClusterTable.places`) that its hits and their time confirm, without a column within REACH.
+    The hits of a group are its clusters times `spacing`. The tree of a column has position and hits of the
     nearest group within REACH; without one, the position of the column and 0 hits.
 
     Args:
@@ -304,6 +304,8 @@ def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters
     """
     place, hits, first, last = table.places(path, p)
     hits *= known.clusters.spacing
+    # As for the hits: each stored scan is for those up to the next one.
+    last = np.minimum(last + known.clusters.spacing - 1, len(path) - 1)
     seen_s = (known.path.stamp_ns[last] - known.path.stamp_ns[first]) / SECOND_NS
     confirmed = (hits >= p.tracking.hits_to_confirm) & (seen_s >= p.tracking.confirm_time)
     columns = _columns(known, p)

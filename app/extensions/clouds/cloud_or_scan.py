@@ -50,9 +50,9 @@ _TILES, _LEAST_OF_TILE = (".las", ".laz", ".ply"), 20_000
 
 
 def is_decided_by_points(table: PointTable) -> bool:
-    """Return whether the points of a table decide: of PCD and KITTI .bin. PLY and NumPy are formats of whole
+    """Return whether the points of a table decide: of PCD and .bin. PLY and NumPy are formats of whole
     clouds, and scans only if their columns say so."""
-    return table.kind.startswith(("PCD", "KITTI"))
+    return table.kind.startswith("PCD") or table.kind.endswith(".bin")
 
 
 def form_of_file(path: Path, options: SourceOptions | None) -> Form:

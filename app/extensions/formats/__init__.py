@@ -46,7 +46,7 @@ def _is_tree_manager(names: Collection[str]) -> bool:
 @cache
 def _formats() -> tuple[AnyFormat, ...]:
     """Return the formats."""
-    from pipeline.io.readers import Format, PacketFormat, ReadingFormat
+    from pipeline.io.readers import Format, MessageFormat, ReadingFormat
     from pipeline.io.readers.sensor_families import CUSTOM_TYPES, HESAI_SCANS, OUSTER_PACKETS
 
     stems = "a folder of TreeManagerState_<i>.csv with trajectory.txt"
@@ -80,16 +80,16 @@ def _formats() -> tuple[AnyFormat, ...]:
             accepts=_later("bin_rows", "is_of_other_data_set"),
         ),
         Format(stems, (), (), _later("tree_manager", "TreeManagerSource"), is_folder=_is_tree_manager),
-        PacketFormat("messages of Livox", CUSTOM_TYPES, columns=_later("livox", "columns_of")),
-        PacketFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "HesaiDecoder")),
-        PacketFormat(
+        MessageFormat("messages of Livox", CUSTOM_TYPES, columns=_later("livox", "columns_of")),
+        MessageFormat("raw packets of Hesai", HESAI_SCANS, sweeps=_later("hesai", "HesaiDecoder")),
+        MessageFormat(
             "raw packets of Ouster",
             OUSTER_PACKETS,
             recording=_later("ouster", "with_packets_decoded"),
             driver="ouster_ros",
         ),
-        PacketFormat("raw packets of Hesai", _HESAI, driver="hesai_ros_driver"),
-        PacketFormat("raw packets of RoboSense", _ROBOSENSE, driver="rslidar_sdk"),
+        MessageFormat("raw packets of Hesai", _HESAI, driver="hesai_ros_driver"),
+        MessageFormat("raw packets of RoboSense", _ROBOSENSE, driver="rslidar_sdk"),
         ReadingFormat(
             role="gnss",
             field="gnss",

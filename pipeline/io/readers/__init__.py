@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
-from pipeline.io.readers.message_formats import PacketFormat, ReadingFormat
+from pipeline.io.readers.message_formats import MessageFormat, ReadingFormat
 
 if TYPE_CHECKING:
     from pipeline.io.readers.point_files import PointTable
 
 __all__ = [
-    "PacketFormat",
+    "MessageFormat",
     "ReadingFormat",
     "Source",
     "SourceDescription",
@@ -277,7 +277,7 @@ FILES = (
 )
 
 _MOST_NAMED = 5
-AnyFormat = Format | PacketFormat | ReadingFormat
+AnyFormat = Format | MessageFormat | ReadingFormat
 K = TypeVar("K")
 _further: list[Callable[[], Iterable[AnyFormat]]] = []
 
@@ -294,13 +294,8 @@ def formats() -> tuple[Format, ...]:
 
 
 def added(kind: type[K]) -> tuple[K, ...]:
-    """Return the formats of a kind that were added."""
+    """Return the formats of a kind, for example `MessageFormat`, that were added."""
     return tuple(each for further in _further for each in further() if isinstance(each, kind))
-
-
-def packet_formats() -> tuple[PacketFormat, ...]:
-    """Return the formats of packets in ROS messages that were added."""
-    return added(PacketFormat)
 
 
 def readable() -> str:

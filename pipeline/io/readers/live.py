@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from pipeline.errors import SourceError
-from pipeline.io.readers import packet_formats
+from pipeline.io.readers import MessageFormat, added
 from pipeline.io.readers.base import (
     RecordedTopic,
     Revision,
@@ -547,7 +547,7 @@ def open_recording(uri: str, path: Path, options: SourceOptions) -> Source:
         run = read_live_header(container, uri)
         if run is not None:
             return LiveRecording(uri, container, run, paths, options)
-        for kind in packet_formats():
+        for kind in added(MessageFormat):
             if kind.recording is not None and not kind.refusal:
                 container = kind.recording(container, path, options, uri)
         return RosSource(uri, container, paths, options)

@@ -44,7 +44,7 @@ class SweepDecoder(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class PacketFormat:
+class MessageFormat:
     """Packets or scans of a maker in ROS messages.
 
     Attributes:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers import packet_formats
+from pipeline.io.readers import MessageFormat, added
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.message_formats import (
@@ -276,9 +276,9 @@ class RecordDecoder:
         return self._decoders[msgtype]
 
     def _of_format(self, msgtype: str, part: str) -> Any:  # noqa: ANN401
-        """Return a part of the format of messages of a maker, see `PacketFormat`; SourceError if no format
+        """Return a part of the format of messages of a maker, see `MessageFormat`; SourceError if no format
         that can be used has it."""
-        kind = next((kind for kind in packet_formats() if msgtype in kind.msgtypes), None)
+        kind = next((kind for kind in added(MessageFormat) if msgtype in kind.msgtypes), None)
         if kind is None or kind.refusal or getattr(kind, part) is None:
             remedy = "" if kind is None else kind.refusal
             raise SourceError(f"messages of the type {msgtype} need an extension", remedy=remedy)

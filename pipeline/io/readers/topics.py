@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from pipeline.errors import SourceError
-from pipeline.io.readers import packet_formats
+from pipeline.io.readers import MessageFormat, added
 from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.container import TRANSFORM_TYPES, Channel
 from pipeline.io.readers.sensor_families import CUSTOM_TYPES, HESAI_SCANS, OUSTER_PACKETS
@@ -256,7 +256,7 @@ def _refuse_packets(topics: list[Topic], where: str) -> None:
     """Raise a SourceError that names maker and driver if a topic has packets that are not decoded; else
     return."""
     for topic in topics:
-        kind = next((kind for kind in packet_formats() if topic.msgtype in kind.msgtypes), None)
+        kind = next((kind for kind in added(MessageFormat) if topic.msgtype in kind.msgtypes), None)
         if kind is not None and topic.count:
             raise SourceError(
                 f"{topic.name} has {kind.words}, which cannot be read ({topic.msgtype})",

@@ -6,7 +6,7 @@ import { fileName } from "../core/download.js";
 import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance } from "../core/nearest.js";
-import { showDone, showNews, showProblem } from "../core/problem.js";
+import { showDone, showProblem } from "../core/problem.js";
 import { isDrive, on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { historyKey } from "../core/undo_keys.js";

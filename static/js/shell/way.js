@@ -2,6 +2,7 @@
 
 import { byId, recall, setText } from "../core/dom.js";
 import { capital, figure } from "../core/format.js";
+import { refusedText } from "../core/permissions.js";
 import { changed, on, state } from "../core/store.js";
 
 export const NO_FIGURES = ["starting", "failed"];
@@ -34,8 +35,9 @@ export function ageOf({ silence_s: silence, map_age_s: mapAge, state: phase }) {
 // A silence of a live run that has mapped something: what is missing, since when [s], why, and whether a person chose it by a pause.
 // Null if there is none.
 export function silenceOf(s) {
-  if (!s?.live || s.scan_index < 0 || state.refused || [...NO_FIGURES, "finished"].includes(s.state)) return null;
-  if (!state.connected) return state.lostAt ? { what: "No connection", for_s: seconds(state.lostAt), why: "The page reconnects by itself." } : null;
+  if (!s?.live || s.scan_index < 0 || [...NO_FIGURES, "finished"].includes(s.state)) return null;
+  if (!state.connected && !state.lostAt) return null;
+  if (!state.connected) return { what: state.refused ? "No access" : "No connection", for_s: seconds(state.lostAt), why: state.refused ? refusedText() : "The page reconnects by itself." };
   if (isOld()) return { what: "No data", for_s: seconds(state.heardAt), why: "The program sends nothing." };
   const isUnheard = NO_DATA.test(s.health);
   if (s.state === "paused") return { what: "Paused: not current", for_s: Math.floor(ageOf(s) ?? 0), why: isUnheard ? capital(s.detail) : "The robot may drive on; obstacles are not reported. Play returns to it.", isChosen: true };

@@ -33,6 +33,7 @@ from app.dashboard.dashboard import Dashboard
 from app.store.async_store import LARGEST_QUEUE, AsyncStore, StoreBusyError
 from app.store.records import Annotation, Content, contents_of
 from app.web.auth import session_value
+from app.web.responses import BadRequestError
 from app.web.routes.annotations import _imported, _ImportTable
 from app.worker.protocol import Shown
 from pipeline.geometry.columns import rows_of
@@ -326,6 +327,15 @@ def test_a_table_for_a_cloud_in_feet_may_be_in_feet_or_metres(metres: float) -> 
     [content], _ = _imported(body, (2_491_000.0 * foot, 6_973_000.0 * foot), (foot, foot))
     assert (content.x, content.y) == pytest.approx((10.0 * foot, 20.0 * foot), abs=1e-6)
     assert content.dbh == pytest.approx(0.31)
+
+
+def test_only_the_wrong_row_of_a_table_in_feet_is_a_fault() -> None:
+    foot = 0.3048
+    table = "x,y\n1640000,18040000\nup,18040000\n"
+    body = _ImportTable.model_validate({"run": 1, **ANN, "table": table})
+    with pytest.raises(BadRequestError) as refused:
+        _imported(body, (1_640_000.0 * foot, 18_040_000.0 * foot), (foot, foot))
+    assert refused.value.what == "line 3: x = 'up' is not a number"
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from app.robot.topics import PICTURE_TYPES, Publisher, choose
 from app.sources.live_address import parse_address
 from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
-from pipeline.io.block_file import SPARE_BYTES
+from pipeline.geometry.file_arrays import SPARE_BYTES
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.camera import SHOWN_NS
 from pipeline.io.readers.container import Message

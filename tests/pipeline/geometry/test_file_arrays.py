@@ -63,3 +63,26 @@ def test_they_are_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> N
     array[:] = 1.0
     assert array.base is None
     assert array.sum() == 2 * LEAST
+
+
+def test_they_leave_room_on_the_disk_for_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.geometry.file_arrays.SPARE_BYTES", 1 << 62)
+    assert empty((LEAST,), np.dtype(np.float64)).base is None
+
+
+def test_another_thread_sees_no_row_before_it_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    table, seen = GrowingColumns(np.arange(4)), list[list[int]]()
+
+    class Copied(np.ndarray):
+        """An array that is looked at from outside while rows are written to it."""
+
+        def __setitem__(self, at: Any, rows: Any) -> None:
+            seen.append(table.column(0).tolist())
+            super().__setitem__(at, rows)
+
+    monkeypatch.setattr(
+        "pipeline.geometry.columns.empty", lambda shape, dtype: np.full(shape, -1, dtype).view(Copied)
+    )
+    table.write(4, np.array([4]))
+    assert seen == [[0, 1, 2, 3], [0, 1, 2, 3]]
+    assert table.column(0).tolist() == [0, 1, 2, 3, 4]

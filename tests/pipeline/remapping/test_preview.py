@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import pipeline.remapping.preview as preview_of
+from pipeline.geometry.columns import rows_of
 from pipeline.remapping.preview import (
     MOST_PLACES,
     SAMPLE_BYTES,
@@ -20,6 +21,7 @@ from pipeline.remapping.preview import (
 )
 from pipeline.remapping.rerun import Rerun, ScanCaches
 from pipeline.types.records import Verdict
+from pipeline.types.units import SECOND_NS
 from tests.pipeline.remapping.mapped import BASE, frames, mapper, run
 
 
@@ -83,6 +85,25 @@ def test_a_long_run_keeps_the_clusters_of_some_scans(known, monkeypatch):
     often = whole.position[whole.observations > 20]
     assert share_within(often, given.position, 0.3) > 0.9
     assert given.observations.sum() == pytest.approx(whole.observations.sum(), rel=0.2)
+
+
+def test_a_stored_scan_also_counts_for_the_time_up_to_the_next_one(known, monkeypatch):
+    before, scans = replace(known[1], columns=None), 12
+    path = rows_of(before.path, slice(0, scans))
+    seen_s = (path.stamp_ns[-1] - path.stamp_ns[0]) / SECOND_NS
+    parameters = BASE.replace({"tracking.confirm_time": seen_s})
+    whole = preview_trees(replace(before, path=path), parameters)
+    monkeypatch.setattr(preview_of, "MOST_SCANS", 3)
+    m, few = mapper(BASE), ClusterTable()
+    for step in run()[0][:scans]:
+        scan = m.segment(step)
+        few.put(step.index, scan.clusters, scan.sensor_offset)
+    assert few.spacing == 4
+    given = preview_trees(replace(before, clusters=few, path=path), parameters)
+    assert whole is not None
+    assert given is not None
+    assert len(whole.position) > 3
+    assert share_within(whole.position, given.position, 0.3) > 0.9
 
 
 @pytest.mark.parametrize("lost", [True, False])

@@ -91,6 +91,14 @@ def test_a_sweep_is_a_scan(tmp_path, uri, thinned):
         assert not is_cloud(pcd(tmp_path / "scan.pcd", points))
 
 
+def test_a_sweep_of_nclt_is_a_scan(tmp_path, sweep):
+    rows = np.zeros(len(sweep), [("xyz", "<u2", 3), ("intensity", "u1"), ("laser", "u1")])
+    rows["xyz"] = np.rint((sweep * [1.0, -1.0, -1.0] + 100.0) / 0.005)
+    path = tmp_path / "1326030975726043.bin"
+    path.write_bytes(rows.tobytes())
+    assert not is_cloud(str(path))
+
+
 def test_columns_and_rows_of_a_sensor_are_a_scan(tmp_path, points, sweep):
     half = len(sweep) // 2 * 2
     assert not is_cloud(pcd(tmp_path / "a.pcd", sweep, extra="ring"))
