@@ -234,6 +234,27 @@ def test_a_silence_is_as_loud_as_a_stop_and_the_picture_looks_stale(dashboard: D
     page.reload()
 
 
+# The server was started again with another link while a robot drives.
+REFUSED = """async () => {
+  const { state, changed } = await import('/static/js/core/store.js');
+  state.status = { ...state.status, live: true, state: 'playing' };
+  Object.assign(state, { connected: false, refused: true, lostAt: performance.now() - 9500 });
+  changed('connection');
+  const way = document.querySelector('#way');
+  return [way.dataset.zone, way.innerText, document.querySelector('#notice').hidden, document.body.className];
+}"""
+
+
+def test_an_alarm_stays_on_a_page_that_the_server_does_not_accept_any_more(dashboard: Dashboard):
+    dashboard.stand(6.05)
+    zone, text, has_no_notice, classes = dashboard.page.evaluate(REFUSED)
+    assert (zone, has_no_notice) == ("silent", True)
+    assert text.startswith("■ No access for 9 s")
+    assert "Open the link that stemmap printed" in text
+    assert "stale" in classes.split()
+    dashboard.page.reload()
+
+
 # The last status, as of a live run that has mapped something; later ones do not come in between.
 LIVE_STATUS = """async (word) => {
   const { state, changed } = await import('/static/js/core/store.js');
