@@ -42,6 +42,11 @@ if TYPE_CHECKING:
 SAME_PLACE = 0.001
 # Two diameters are the same below this difference [m]: an exported table has 0.1 mm.
 _SAME_DBH = 0.0001
+# Of the difference between a diameter by tape and that of the map; a normal error is larger in 1 of 16,000
+# trees.
+_MOST_SIGMAS = 4.0
+# [m]; a diameter beyond is often in another unit where the map has none.
+_USUAL_DBH = (0.03, 1.5)
 
 Against = Literal["both", "own", "annotations"]
 Counted = Literal["none", "source", "annotations", "both"]
@@ -361,9 +366,9 @@ class AnnotationEditor:
         The keys are `run`, `serial`, `problem` and `against`, the attributes; `used`, the result of
         `counted`; `own`, the number of objects in the ground truth of the source, None if there is none;
         `contradicting`, the result of this function; `same_thing_m`, SAME_THING;
-        `tape_sigma_cm`, TAPE_SIGMA in cm; `trees` and `skipped`, lists of `row_payload`; `others`, a dict
-        from the class of each of `others` to a list of `values_payload`; `repairs`, the `identity_of` the
-        repairs; and `frame`, the `values_payload` of `frame`, None for a local map.
+        `doubt`, the limits of `is_doubtful_dbh` in cm; `trees` and `skipped`, lists of `row_payload`;
+        `others`, a dict from the class of each of `others` to a list of `values_payload`; `repairs`, the
+        `identity_of` the repairs; and `frame`, the `values_payload` of `frame`, None for a local map.
         """
         return {
             "run": self.run,
@@ -374,7 +379,11 @@ class AnnotationEditor:
             "own": None if self._own is None else len(self._own.x),
             "contradicting": contradicting(self._own, self.rows),
             "same_thing_m": SAME_THING,
-            "tape_sigma_cm": 100.0 * TAPE_SIGMA,
+            "doubt": {
+                "sigmas": _MOST_SIGMAS,
+                "tape_sigma_cm": 100.0 * TAPE_SIGMA,
+                "usual_cm": [100.0 * limit for limit in _USUAL_DBH],
+            },
             "trees": [row_payload(row) for row in self.rows],
             "skipped": [row_payload(row) for row in self.skipped],
             "others": {
@@ -384,6 +393,14 @@ class AnnotationEditor:
             "repairs": identity_of(self.repairs),
             "frame": None if self.frame is None else values_payload(self.frame),
         }
+
+
+def is_doubtful_dbh(dbh: float, mapped: float, sigma: float) -> bool:
+    """Return whether a diameter by tape differs from that of the map, which may be NaN, by more than chance,
+    or is unusual where the map has none [m]. Such a diameter is often in another unit."""
+    if not math.isfinite(mapped):
+        return not _USUAL_DBH[0] <= dbh <= _USUAL_DBH[1]
+    return abs(dbh - mapped) > _MOST_SIGMAS * math.hypot(sigma, TAPE_SIGMA)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ _DBH_OF_UNKNOWN_UNIT = ("dbh", "bhd", "diameter")
 DBH_COLUMNS = (*_DBH, *_DBH_OF_UNKNOWN_UNIT)
 #: Range of the median diameter of a table [m]: from a seedling's to that of the thickest trees there are.
 _MEDIAN_DBH = (0.005, 3.0)
-_KIND = ("class", "kind", "type")
+KIND_COLUMNS = ("class", "kind", "type")
 #: Index of the row and error of each fault in a table, see `refuse_faults`.
 Faults = list[tuple[int, SourceError]]
 
@@ -147,7 +147,7 @@ def _diameters(table: CsvTable, dbh_unit: str | None, faults: Faults) -> Float:
 def _kinds(table: CsvTable, faults: Faults) -> tuple[str, ...]:
     """Return the class of each row in lower case; "tree" for an empty cell, and for all rows if there is no
     column of classes."""
-    name = table.find(_KIND)
+    name = table.find(KIND_COLUMNS)
     if name is None:
         return ("tree",) * len(table.rows)
     kinds = tuple(text.lower() or "tree" for text in table.text(name))

@@ -1293,7 +1293,8 @@ def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_nam
     page.locator("#annotate-replaces").check()
     file.set_input_files({"name": "plot.csv", "mimeType": "text/csv", "buffer": table.encode()})
     expect(hint).to_contain_text(
-        f"0 trees imported from plot.csv; 1 annotation replaced; {len(trees) - 1} left"
+        f"0 trees imported from plot.csv; 1 annotation replaced (tree {trees[1]['number']}: tree -> pole); "
+        f"{len(trees) - 1} left"
     )
     assert rows(person)[1]["kind"] == "pole"
     page.locator("#annotate-replaces").uncheck()

@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -18,7 +18,14 @@ from starlette.responses import Response
 
 from app.batch.run_edits import SAME_THING, annotation_of_tree, reach_at
 from app.common.user import is_user_name
-from app.dashboard.annotations import SAME_PLACE, Against, carried_back, import_plan, row_payload
+from app.dashboard.annotations import (
+    SAME_PLACE,
+    Against,
+    carried_back,
+    import_plan,
+    is_doubtful_dbh,
+    row_payload,
+)
 from app.dashboard.dashboard import Dashboard
 from app.store.records import (
     KINDS,
@@ -39,12 +46,15 @@ from pipeline.errors import SourceError
 from pipeline.repairs.record import Repair
 from pipeline.types.records import Trees
 
+if TYPE_CHECKING:
+    from pipeline.io.csv_table import CsvTable
+
 router = APIRouter(prefix="/api")
 
 _LARGEST_DBH_M = 10.0
 _AT_TREE_M = 0.1  # an answer is given at the tree, which moves in a live map until it arrives
 _FEW_DIAMETERS = 3  # of a table and of the map, whose median tells the unit
-_MOST_NAMED = 3  # contradictions of an import that are named
+_MOST_NAMED = 3  # contradictions, replacements and doubts of an import that are named
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
 
 
@@ -185,7 +195,8 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     Return the number of added annotations (`added`), of diameters added to others (`filled`), of annotations
     whose class or diameter is replaced (`replaced`), of rows that exist already as annotations or earlier in
     the table (`left_out`), and of rows that are left out because they contradict an annotation (`differing`),
-    with the first of these as text (`differences`); of rows that are not exactly at the place of their
+    with the first of these, of what is replaced (`replacements`), and of the doubtful diameters (`doubts`, in
+    all `doubtful`) as text; of rows that are not exactly at the place of their
     annotation (`beside`), with the smallest and the largest distance (`beside_m`); and the counts of edits,
     see `edited`. 422 if the table cannot be read or has too many rows or rows with faults, of which the first
     10 are named, 409 as in `add`; then nothing is stored. Without anything new there is no edit."""
@@ -198,9 +209,16 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
         dashboard.annotation_editor.rows, contents, replaces=body.replaces, has_diameters=has_diameters
     )
     changed = [*plan.filled, *plan.replaced]
+    before = {row.id: row.content for row in dashboard.annotation_editor.rows}
+    replacements = [
+        _replacement(dashboard, before[number], content)
+        for number, _, content in plan.replaced[:_MOST_NAMED]
+        if content is not None
+    ]
     added = [replace(each, reach=_reach_at(dashboard, each.x, each.y)) for each in plan.added]
     if added or changed:
         await apply_edit(dashboard, body, Store.edit, added, changed)
+    doubts = _doubts(dashboard, [*added, *(content for _, _, content in changed if content is not None)])
     payload = {
         "added": len(added),
         "filled": len(plan.filled),
@@ -208,6 +226,9 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
         "left_out": plan.repeated,
         "differing": len(plan.conflicts),
         "differences": [_difference(dashboard, *pair) for pair in plan.conflicts[:_MOST_NAMED]],
+        "replacements": replacements,
+        "doubtful": len(doubts),
+        "doubts": doubts[:_MOST_NAMED],
         "beside": len(plan.beside),
         "beside_m": [round(end(plan.beside), 3) for end in (min, max) if plan.beside],
     }
@@ -316,15 +337,50 @@ def _tree_numbers(dashboard: Dashboard) -> dict[Content, int]:
     return {contents[k]: numbers[row] for row, k in of_tree.items()}
 
 
+def _name(dashboard: Dashboard, content: Content) -> str:
+    """Return what people call the thing of an annotation: its tree, else its place."""
+    number = _tree_numbers(dashboard).get(content)
+    x, y = dashboard.offset
+    return (
+        f"the annotation at {content.x + x:.2f}, {content.y + y:.2f}" if number is None else f"tree {number}"
+    )
+
+
+def _dbh_text(dbh: float | None) -> str:
+    """Return a diameter [m] for people, with at most 0.1 mm."""
+    return "no DBH" if dbh is None else f"{100.0 * dbh:.2f}".rstrip("0").rstrip(".") + " cm"
+
+
 def _difference(dashboard: Dashboard, here: Content, there: Content) -> str:
     """Return how a row of a table (`there`) contradicts the annotation at its place."""
-    number = _tree_numbers(dashboard).get(here)
-    x, y = dashboard.offset
-    name = f"the annotation at {here.x + x:.2f}, {here.y + y:.2f}" if number is None else f"tree {number}"
+    name = _name(dashboard, here)
     if here.kind != there.kind:
         return f"{name} is {here.kind} here, {there.kind} in the file"
-    mine, other = (f"{100.0 * (dbh or 0.0):.2f}".rstrip("0").rstrip(".") for dbh in (here.dbh, there.dbh))
-    return f"{name} has DBH {mine} cm here, {other} cm in the file"
+    return f"{name} has DBH {_dbh_text(here.dbh)} here, {_dbh_text(there.dbh)} in the file"
+
+
+def _replacement(dashboard: Dashboard, before: Content, after: Content) -> str:
+    """Return how a row of a table changes the annotation that it replaces."""
+    was, now = (
+        (before.kind, after.kind) if before.kind != after.kind else map(_dbh_text, (before.dbh, after.dbh))
+    )
+    return f"{_name(dashboard, before)}: {was} -> {now}"
+
+
+def _doubts(dashboard: Dashboard, contents: Sequence[Content]) -> list[str]:
+    """Return a text for each annotation of a tree of the shown map with a doubtful DBH, see
+    `is_doubtful_dbh`."""
+    if dashboard.shown is None:
+        return []
+    trees, doubts = dashboard.shown.frame.trees, list[str]()
+    rows = np.flatnonzero(trees.confirmed)
+    for k, of in annotation_of_tree(trees.position[rows], contents).items():
+        row, dbh = rows[k], contents[of].dbh
+        mapped, sigma = float(trees.dbh[row]), float(trees.dbh_sigma[row])
+        if dbh is not None and is_doubtful_dbh(dbh, mapped, sigma):
+            here = f"{_dbh_text(mapped)} in the map" if math.isfinite(mapped) else "none in the map"
+            doubts.append(f"tree {trees.number[row]} has {_dbh_text(dbh)}, {here}")
+    return doubts
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
@@ -394,7 +450,7 @@ def _imported(
     """
     from app.batch.run_folder import truth_in_metres
     from pipeline.io.csv_table import CsvTable, refuse_faults
-    from pipeline.io.ground_truth import DBH_COLUMNS, Faults, truth_trees_of
+    from pipeline.io.ground_truth import DBH_COLUMNS, KIND_COLUMNS, Faults, truth_trees_of
 
     faults: Faults = []
     try:
@@ -404,6 +460,10 @@ def _imported(
         trees = truth_in_metres(truth_trees_of(table, faults, dbh_unit=body.dbh_unit), unit, offset)
         placed = contents_of(replace(trees, x=trees.x - offset[0], y=trees.y - offset[1]))
         contents = [replace(each, who=who) for each, who in zip(placed, table.text("who"), strict=True)]
+        diameters = table.find(DBH_COLUMNS)
+        if body.replaces and (kind := table.find(KIND_COLUMNS)) is not None:
+            faults += _empty_classes(table, kind)
+        faults += [] if diameters is None else _no_diameters(table, diameters)
         for k, content in enumerate(contents):
             for fault in _faults(content):
                 what = f"line {table.lines[k]}: {fault.what}"
@@ -412,4 +472,18 @@ def _imported(
     except SourceError as error:
         remedy = "Choose the unit of the diameter" if "its unit" in error.what else error.remedy
         raise BadRequestError(error.what, where=error.where, remedy=remedy) from None
-    return contents, table.find(DBH_COLUMNS) is not None
+    return contents, diameters is not None
+
+
+def _empty_classes(table: CsvTable, name: str) -> Iterator[tuple[int, SourceError]]:
+    """Yield a fault for each row without a class, with which it would replace that of its annotation."""
+    for k, text in enumerate(table.text(name)):
+        if not text:
+            yield k, SourceError(f"line {table.lines[k]}: no {name}", where=table.where)
+
+
+def _no_diameters(table: CsvTable, name: str) -> Iterator[tuple[int, SourceError]]:
+    """Yield a fault for each diameter of 0 or less; an empty cell states none."""
+    for k, diameter in enumerate(table.numbers(name, required=False, faults={})):
+        if diameter <= 0.0:
+            yield k, SourceError(f"line {table.lines[k]}: {name} {diameter:g} is no DBH", where=table.where)

@@ -17,7 +17,6 @@ export const KINDS = ["tree", "pole", "person", "bush", "other"];
 const SKIPPED = "skipped"; // class of an annotation that states nothing
 export const STATES = ["open", "confirmed", "rejected", "skipped"]; // of a found tree in the review
 const LARGEST_DBH = 1000; // [cm]
-const MOST_SIGMAS = 4; // of the difference between a diameter by tape and that of the map; a normal error is larger in 1 of 16,000 trees
 const MOST_ANSWERED = 20; // answers to which the review returns
 // [ms] for which a card must have been on the screen before it is answered: what takes less is no judgement of its picture. People
 // need about 150 ms to recognise the content of a picture (Thorpe, Fize and Marlot, Nature 381, 1996). A choice between two answers
@@ -546,12 +545,14 @@ function replacedText({ before, kind, dbh, isStored }) {
 
 export const byOther = (row) => (row.who === myName() ? "" : ` by ${row.who}`);
 
-// Why a DBH that is typed for a found tree [cm] is doubtful; "" if it is not. One that differs from that of the map by more than
-// chance is often in another unit.
-export function typedDoubt({ dbh_cm: mapped, sigma_dbh_cm: sigma }, dbh) {
-  if ([dbh, mapped, sigma].includes(null)) return "";
-  const isNear = Math.abs(dbh - mapped) <= MOST_SIGMAS * Math.hypot(sigma, state.annotations?.tape_sigma_cm ?? 0);
-  return isNear ? "" : `The map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
+// Why a typed DBH [cm] is doubtful, see `is_doubtful_dbh` in app/dashboard/annotations.py; "" if it is not. `tree` is the found tree, null
+// without one.
+export function typedDoubt(tree, dbh) {
+  if (dbh === null || !state.annotations) return "";
+  const { sigmas, tape_sigma_cm: own, usual_cm: [least, most] } = state.annotations.doubt;
+  const mapped = tree?.dbh_cm ?? null, sigma = tree?.sigma_dbh_cm ?? 0;
+  if (mapped !== null) return Math.abs(dbh - mapped) <= sigmas * Math.hypot(sigma, own) ? "" : `The map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
+  return dbh >= least && dbh <= most ? "" : `Few stems are ${dbh < least ? `thinner than ${least}` : `thicker than ${most}`} cm. Was it typed in cm?`;
 }
 
 // --- the chosen annotation -------------------------------------------------------------------------------------

@@ -108,16 +108,18 @@ async function take(file, unit, replaces) {
   const confirmed = () => trees().filter((tree) => reviewOf(tree) === "confirmed").length, before = confirmed();
   const done = await importTable(await file.text(), file.name, unit, replaces);
   const more = confirmed() - before;
-  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}.`;
+  if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced (${listed(done.replacements, done.replaced)})` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}${done.doubtful ? `; check ${count(done.doubtful, "diameter")}: ${listed(done.doubts, done.doubtful)}` : ""}.`;
   if (done) showDone(imported);
   else showProblem(draft.error); // the button is below the list, the error above it
   fill();
 }
 
+// The first ones of a number of texts.
+const listed = (texts, number) => `${texts.join("; ")}${number > texts.length ? `; and ${number - texts.length} more` : ""}`;
+
 function differingText({ differing, differences }) {
   if (!differing) return "";
-  const more = differing - differences.length;
-  return `; ${differing} ${differing === 1 ? "differs from its annotation and was" : "differ from their annotations and were"} left out: ${differences.join("; ")}${more ? `; and ${more} more` : ""}`;
+  return `; ${differing} ${differing === 1 ? "differs from its annotation and was" : "differ from their annotations and were"} left out: ${listed(differences, differing)}`;
 }
 
 function besideText({ beside, beside_m: [least, most] }) {
@@ -155,11 +157,11 @@ function openCard(row, target) {
 function takeDbh(line, input) {
   const dbh = typedDbh(input.value), tree = treeOf(treeNumberOf(line.row));
   if (dbh === undefined) return null;
-  const doubt = tree && input.dataset.asked !== String(dbh) ? typedDoubt(tree, dbh) : "";
+  const doubt = input.dataset.asked !== String(dbh) ? typedDoubt(tree, dbh) : "";
   input.dataset.asked = doubt ? String(dbh) : "";
   if (!doubt) return change(line.row, { dbh_cm: dbh });
   input.value = line.row.dbh_cm === null ? "" : String(line.row.dbh_cm);
-  draft.error = `The DBH ${dbh} cm of tree ${tree.number} was not stored. ${doubt} Type it again to store it.`;
+  draft.error = `The DBH ${dbh} cm ${tree ? `of tree ${tree.number} ` : ""}was not stored. ${doubt} Type it again to store it.`;
   return fill();
 }
 

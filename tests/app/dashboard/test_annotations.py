@@ -376,6 +376,47 @@ async def test_all_faults_of_a_table_are_named(both: Running) -> None:
     assert refused["what"].endswith("; and 3 more")
 
 
+async def test_a_cell_that_states_nothing_neither_confirms_nor_removes(both: Running) -> None:
+    client, _ = both
+    await edit(client, "POST", x=1.0, y=2.0, kind="pole")
+    await edit(client, "POST", x=3.0, y=2.0, dbh_cm=26.4)
+    before = await rows(client)
+    for table, fault in (
+        ("1,2,,\n3,2,26.4,tree\n", "line 2: no class"),
+        ("3,2,0,tree\n", "dbh_cm 0 is no DBH"),
+        ("3,2,-3,tree\n", "dbh_cm -3 is no DBH"),
+    ):
+        text = f"x_m,y_m,dbh_cm,class\n{table}"
+        answer = await edit(client, "POST", "/import", table=text, replaces=True)
+        assert fault in answer.json()["error"]["what"]
+    assert await rows(client) == before
+
+
+async def test_an_import_names_what_it_replaces_and_which_diameters_are_doubtful(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    assert dashboard.shown is not None
+    trees = dashboard.shown.frame.trees
+    at, numbers = trees.position[trees.confirmed], trees.number[trees.confirmed]
+    trees.dbh[:], trees.dbh_sigma[:] = 0.222, 0.01
+    trees.dbh[np.flatnonzero(trees.confirmed)[1]] = np.nan
+    table = "x_m,y_m,dbh_cm,class\n" + "".join(
+        f"{x},{y},{dbh},tree\n" for (x, y), dbh in zip(at.tolist(), (222.0, 0.34, 23.0), strict=False)
+    )
+    answer = (await edit(client, "POST", "/import", table=table)).json()
+    assert answer["doubtful"] == 2
+    assert answer["doubts"] == [
+        f"tree {numbers[0]} has 222 cm, 22.2 cm in the map",
+        f"tree {numbers[1]} has 0.34 cm, none in the map",
+    ]
+    right = table.replace("222.0", "22.2").replace("0.34,tree", ",pole")
+    answer = (await edit(client, "POST", "/import", table=right, replaces=True)).json()
+    assert (answer["replaced"], answer["doubtful"]) == (2, 0)
+    assert answer["replacements"] == [
+        f"tree {numbers[0]}: 222 cm -> 22.2 cm", f"tree {numbers[1]}: tree -> pole",
+    ]  # fmt: skip
+
+
 async def test_an_imported_row_has_the_author_of_its_table_else_the_name_of_the_file(both: Running) -> None:
     client, _ = both
 
