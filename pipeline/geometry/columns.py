@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.file_arrays import empty
+from pipeline.geometry.file_arrays import extended
 
 POINT = 1.0 / 256  # m; step of a return: a standard error of 1.1 mm, that of a sensor is 10 to 30 mm
 GROUND = 1.0 / 1024  # m; step of a ground height
@@ -38,7 +38,7 @@ Column = NDArray[Any]
 
 
 class GrowingColumns:
-    """Columns of N rows; the capacity doubles when it is full. Large columns are in files, see `empty`.
+    """Columns of N rows; the capacity doubles when it is full. Large columns are in files, see `extended`.
 
     Columns that `shared` returned share their memory with later ones, but their values never change: where
     one of their rows is replaced, the columns get new memory.
@@ -75,10 +75,9 @@ class GrowingColumns:
         end, capacity = start + len(rows[0]), len(self._columns[0])
         if start < self._rows_shared or end > capacity:
             capacity = 2 * end if end > capacity else capacity
-            larger = [empty((capacity, *column.shape[1:]), column.dtype) for column in self._columns]
-            for column, old in zip(larger, self._columns, strict=True):
-                column[: len(old)] = old
-            self._columns, self._rows_shared = larger, 0  # only now: another thread may read
+            # Set once all rows are copied: another thread may read them.
+            self._columns = [extended(column, capacity) for column in self._columns]
+            self._rows_shared = 0
         for column, new in zip(self._columns, rows, strict=True):
             column[start:end] = new
         self._length = end

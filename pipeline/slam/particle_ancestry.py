@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.geometry.columns import GrowingColumns
-from pipeline.geometry.file_arrays import empty
+from pipeline.geometry.file_arrays import extended
 from pipeline.geometry.pose_arrays import composed, inverse
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.types.records import Float32, Int, Path
@@ -119,11 +119,11 @@ if hasattr(os, "register_at_fork"):
 
 
 def _stored(block: Float) -> Float:
-    """Return a copy of the poses of BLOCK scans in a file, see `file_arrays.empty`."""
+    """Return a copy of the poses of BLOCK scans in a file, see `file_arrays.extended`."""
     try:
         copy = _unused.pop()
     except IndexError:
-        copy, *others = empty((_BLOCKS, BLOCK, 3), np.dtype(np.float64))
+        copy, *others = extended(np.zeros((0, BLOCK, 3)), _BLOCKS)
         _unused.extend(others)
     copy[:] = block
     return copy

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.columns import GrowingColumns
-from pipeline.geometry.file_arrays import LEAST, empty
+from pipeline.geometry.file_arrays import LEAST, extended
 from pipeline.seen_area import SeenRecorder
 from tests.benchmarks.machine import anonymous_mib
 
@@ -48,7 +48,7 @@ def open_files() -> int:
 @on_linux
 def test_their_files_are_deleted_with_them() -> None:
     known = open_files()
-    array = empty((LEAST,), np.dtype(np.int64))
+    array = extended(np.zeros(0, np.int64), LEAST)
     assert open_files() == known + 1
     del array
     assert open_files() == known
@@ -59,7 +59,7 @@ def test_they_are_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> N
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    array = empty((LEAST, 2), np.dtype(np.float64))
+    array = extended(np.zeros((0, 2)), LEAST)
     array[:] = 1.0
     assert array.base is None
     assert array.sum() == 2 * LEAST
@@ -67,22 +67,26 @@ def test_they_are_in_memory_on_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_they_leave_room_on_the_disk_for_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pipeline.geometry.file_arrays.SPARE_BYTES", 1 << 62)
-    assert empty((LEAST,), np.dtype(np.float64)).base is None
+    assert extended(np.zeros(0), LEAST).base is None
+
+
+def test_they_begin_with_the_given_rows() -> None:
+    rows = np.arange(6 * LEAST).reshape(-1, 3)[::2]
+    array = extended(rows, 2 * LEAST)
+    assert array.base is not None
+    assert np.array_equal(array[: len(rows)], rows)
+    array[:] = 1
+    assert rows[1, 0] == 6
 
 
 def test_another_thread_sees_no_row_before_it_is_copied(monkeypatch: pytest.MonkeyPatch) -> None:
-    table, seen = GrowingColumns(np.arange(4)), list[list[int]]()
+    table, seen = GrowingColumns(np.arange(4), np.arange(4)), list[list[int]]()
 
-    class Copied(np.ndarray):
-        """An array that is looked at from outside while rows are written to it."""
+    def looked_at(rows: Any, length: int) -> Any:
+        seen.append(table.column(0).tolist())
+        return extended(rows, length)
 
-        def __setitem__(self, at: Any, rows: Any) -> None:
-            seen.append(table.column(0).tolist())
-            super().__setitem__(at, rows)
-
-    monkeypatch.setattr(
-        "pipeline.geometry.columns.empty", lambda shape, dtype: np.full(shape, -1, dtype).view(Copied)
-    )
-    table.write(4, np.array([4]))
-    assert seen == [[0, 1, 2, 3], [0, 1, 2, 3]]
+    monkeypatch.setattr("pipeline.geometry.columns.extended", looked_at)
+    table.write(4, np.array([4]), np.array([4]))
+    assert seen == 2 * [[0, 1, 2, 3]]
     assert table.column(0).tolist() == [0, 1, 2, 3, 4]
