@@ -615,9 +615,10 @@ export function truthText() {
   }[state.annotations?.used] ?? "";
 }
 
-export function contradictionText() {
+// `end` comes after the text.
+export function contradictionText(end) {
   const number = contradicting().length;
-  return number ? `${count(number, "annotation")} ${number === 1 ? "contradicts" : "contradict"} the ground truth of this run and ${number === 1 ? "replaces" : "replace"} it there:` : "";
+  return number ? `${count(number, "annotation")} ${number === 1 ? "contradicts" : "contradict"} the ground truth of this run and ${number === 1 ? "replaces" : "replace"} it there${end}` : "";
 }
 
 // The annotations that contradict the ground truth of the run where both are used.

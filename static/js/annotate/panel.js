@@ -209,7 +209,7 @@ function fill() {
   fillHistory();
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
-  setText(byId("annotate-warned"), contradictionText());
+  setText(byId("annotate-warned"), contradictionText(":"));
   fillRows(byId("annotate-contradicting"), contradicting());
   const without = withoutTree(), [said, list] = byId("annotate-without").children;
   byId("annotate-without").hidden = !without.length;

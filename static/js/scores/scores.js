@@ -39,7 +39,7 @@ const LINES = [
 function show() {
   if (!visible("scores")) return;
   const score = state.evaluation;
-  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthText(), contradictionText()].filter(Boolean).join(" ") }), doubt(score), rates(score), counted(score), lines(score)] : [nothing()]));
+  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthText(), contradictionText("; the tab Annotate lists them.")].filter(Boolean).join(" ") }), doubt(score), rates(score), counted(score), lines(score)] : [nothing()]));
 }
 
 // A warning that so few trees match that the ground truth may belong to another place.
