@@ -236,7 +236,8 @@ def test_hits_count_where_returns_are_gathered_only_from_nearer():
 )
 def test_hits_make_no_tree_of_who_walked_on(seen_s, unseen_s, stays):
     """Far away, where nothing is gathered and no miss is counted."""
-    tracker, scans = Tracker(FOREST.tracking), 5
+    tracking = FOREST.tracking.model_copy(update={"confirm_time": 0.0})
+    tracker, scans = Tracker(tracking), 5
     for k in range(scans):
         stamp_ns = round(1e9 * seen_s * k / (scans - 1))
         found = detections([[20.0, -3.0]])
