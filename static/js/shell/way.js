@@ -71,9 +71,9 @@ export function poseHealth({ health: word, state: phase, source }) {
 function showWay() {
   const status = state.status, clearance = state.map?.clearance, silence = silenceOf(status);
   if (status?.compiling_since_s) compiledAt = performance.now();
-  // Only a robot that drives on has something in its way, and only a scan of now shows it.
+  // An obstacle is reported only from a current scan of a run that goes on.
   const quiet = [...NO_FIGURES, "finished", "waiting"].includes(status?.state) || !state.connected || isOld()
-    || (status?.live && status.state === "paused"); // the robot drives on
+    || (status?.live && status.state === "paused"); // its last scan is old
   const obstacle = !silence && !quiet && WAY[clearance?.zone] ? clearance : null;
   const health = status ? poseHealth(status) : {};
   const poseLost = !silence && !quiet && status?.live && health.state === "lost" && obstacle?.zone !== "stop";

@@ -59,12 +59,12 @@ def test_a_fixed_transform_after_the_first_scans_is_told_and_not_used(drive: Pat
     (mounting, *_) = [message for message in messages if message.channel == fixed]
     others = [message for message in messages if message.channel != fixed]
     late = [replace(mounting, log_ns=message.log_ns) for message in others[-2:]]  # it is sent twice
-    for rest, told in (([*others, *late], 1), ([mounting, *others, *late], 0)):
+    for rest, warnings in (([*others, *late], 1), ([mounting, *others, *late], 0)):
         reader, records = read(container.channels, iter(rest))
         assert reader.description is not None
-        assert (reader.description.T_base_lidar.t[2] == 0.9) == (told == 0)
+        assert (reader.description.T_base_lidar.t[2] == 0.9) == (warnings == 0)
         notices = [record.text for record in records if isinstance(record, Notice)]
-        assert len(notices) == told
+        assert len(notices) == warnings
         assert all("arrived after the first scans and is not used" in notice for notice in notices)
     options = SourceOptions(T_base_lidar=Pose3.identity())
     reader = ArrivalReader("here", "live", container.channels, options)

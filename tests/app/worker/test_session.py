@@ -535,10 +535,10 @@ def test_a_robot_whose_scans_wait_is_not_called_silent_unless_it_is_paused(
         recorded_file="",
         losses={"scans lost on the network": 3, "scans skipped because mapping was behind": 162},
     )
-    told = with_robot(Status(state=before, source="zenoh:", scan_index=5), cast(Any, robot))
-    assert (told.state, told.detail) == (state, "Nothing heard for 3 s" if is_silent else "")
-    assert (told.health == "no data for 3 s") == is_silent
-    assert (told.silence_s, told.map_age_s, told.scans_lost) == (3.0, 7.0, 3)
+    status = with_robot(Status(state=before, source="zenoh:", scan_index=5), cast(Any, robot))
+    assert (status.state, status.detail) == (state, "Nothing heard for 3 s" if is_silent else "")
+    assert (status.health == "no data for 3 s") == is_silent
+    assert (status.silence_s, status.map_age_s, status.scans_lost) == (3.0, 7.0, 3)
 
 
 def test_a_source_without_a_mapper_is_closed() -> None:
