@@ -45,8 +45,11 @@ _SAME_DBH = 0.0001
 # Of the difference between a diameter by tape and that of the map; a normal error is larger in 1 of 16,000
 # trees.
 _MOST_SIGMAS = 4.0
-# [m]; a diameter beyond is often in another unit where the map has none.
+# [m]; a diameter beyond is often in another unit. They are used where the map has too few diameters.
 _USUAL_DBH = (0.03, 1.5)
+# Of n diameters of a stand, the next one lies outside their range with probability 2 / (n + 1): with this
+# many, at most every fifth right one is asked about.
+_FEWEST_DBH = 9
 
 Against = Literal["both", "own", "annotations"]
 Counted = Literal["none", "source", "annotations", "both"]
@@ -383,6 +386,7 @@ class AnnotationEditor:
                 "sigmas": _MOST_SIGMAS,
                 "tape_sigma_cm": 100.0 * TAPE_SIGMA,
                 "usual_cm": [100.0 * limit for limit in _USUAL_DBH],
+                "fewest": _FEWEST_DBH,
             },
             "trees": [row_payload(row) for row in self.rows],
             "skipped": [row_payload(row) for row in self.skipped],
@@ -395,11 +399,18 @@ class AnnotationEditor:
         }
 
 
-def is_doubtful_dbh(dbh: float, mapped: float, sigma: float) -> bool:
+def usual_dbh(mapped: Float) -> tuple[float, float]:
+    """Return the least and the largest diameter of a map [m], of which some may be NaN; those of any stand if
+    the map has fewer than _FEWEST_DBH."""
+    known = mapped[np.isfinite(mapped)]
+    return (float(known.min()), float(known.max())) if len(known) >= _FEWEST_DBH else _USUAL_DBH
+
+
+def is_doubtful_dbh(dbh: float, mapped: float, sigma: float, usual: tuple[float, float]) -> bool:
     """Return whether a diameter by tape differs from that of the map, which may be NaN, by more than chance,
-    or is unusual where the map has none [m]. Such a diameter is often in another unit."""
+    or lies outside `usual` where the map has none [m]. Such a diameter is often in another unit."""
     if not math.isfinite(mapped):
-        return not _USUAL_DBH[0] <= dbh <= _USUAL_DBH[1]
+        return not usual[0] <= dbh <= usual[1]
     return abs(dbh - mapped) > _MOST_SIGMAS * math.hypot(sigma, TAPE_SIGMA)
 
 
@@ -412,7 +423,7 @@ class ImportPlan:
         filled, replaced: Id, version and new content of each annotation that gets a DBH, and of each one
             whose class or DBH is replaced.
         conflicts: The annotation and the row that contradicts it, of each row that is left out for that.
-            Other contents have their author, empty if the row names none or that of the annotation.
+            Other contents have their authors, empty if the row names none or those of the annotation.
         repeated: Number of rows that say nothing new.
         beside: Distance between row and annotation [m], of each row that is about an annotation but not at
             its place.
@@ -464,15 +475,18 @@ def import_plan(
         here = known[j]
         dbh = content.dbh if content.dbh is not None or (replaces and has_diameters) else here.dbh
         is_other_dbh = here.dbh is not None and (dbh is None or abs(here.dbh - dbh) > _SAME_DBH)
-        who = "" if j < len(rows) and content.who == rows[j].who else content.who
+        if j < len(rows):  # a table that was saved here names the authors of what it changes
+            who = "" if content.who == rows[j].who else content.who
+            dbh_who = "" if content.dbh_who == rows[j].dbh_who else content.dbh_who
+            content = replace(content, who=who, dbh_who=dbh_who)
         if here.kind != content.kind or is_other_dbh:
             if replaces and j < len(rows) and j not in replaced | filled:
-                known[j] = replace(here, kind=content.kind, dbh=dbh, who=who)
+                known[j] = replace(here, kind=content.kind, dbh=dbh, who=content.who, dbh_who=content.dbh_who)
                 replaced.add(j)
             else:
                 conflicts.append((here, content))
         elif here.dbh is None and dbh is not None:
-            known[j] = replace(here, dbh=dbh, who=who)
+            known[j] = replace(here, dbh=dbh, who=content.who, dbh_who=content.dbh_who)
             filled.add(j)
     added = [known[j] for j in range(len(rows), len(known)) if object_of[j] == j]
     edits: list[list[tuple[int, int, Content | None]]] = [
@@ -676,17 +690,22 @@ def carried_back(repair: Repair, changes: Sequence[Changed]) -> list[tuple[int, 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
     """Return the author of the newest edit ("" if annotations were only deleted) and the number of
     annotations that were added, changed or deleted between two states, by id and version."""
-    old = {row.id: row.version for row in before}
-    new = {row.id: row.version for row in after}
-    edited = [row for row in after if old.get(row.id) != row.version]
-    who = max(edited, key=lambda row: row.at_ns).who if edited else ""
-    return who, len(edited) + len(old.keys() - new.keys())
+    old = {row.id: row for row in before}
+    edited = [row for row in after if row.id not in old or old[row.id].version != row.version]
+    deleted = len(old.keys() - {row.id for row in after})
+    if not edited:
+        return "", deleted
+    newest = max(edited, key=lambda row: row.at_ns)
+    was = old.get(newest.id)
+    is_dbh_only = was is not None and replace(newest.content, dbh=was.content.dbh) == was.content
+    return (newest.dbh_who if is_dbh_only else "") or newest.who, len(edited) + deleted
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:
     """Return an annotation of an object as a dict of JSON values for the dashboard: `id`, `x` and `y` in the
-    map [m], `kind`, `dbh_cm` (None if unknown), `reach_m` (see `reach_of`), `who`,
-    `at_s` (time of the last edit [s since 1970], to the millisecond) and `version`."""
+    map [m], `kind`, `dbh_cm` (None if unknown), `reach_m` (see `reach_of`), the authors `who` and
+    `dbh_who` ("" without a DBH), `at_s` (time of the last edit [s since 1970], to the millisecond) and
+    `version`."""
     content = row.content
     return {
         "id": row.id,
@@ -696,6 +715,7 @@ def row_payload(row: Annotation) -> dict[str, Any]:
         "dbh_cm": None if content.dbh is None else round(100.0 * content.dbh, 2),
         "reach_m": round(reach_of(content), 4),
         "who": row.who,
+        "dbh_who": row.dbh_who,
         "at_s": round(row.at_ns / 1e9, 3),
         "version": row.version,
     }

@@ -13,18 +13,19 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.errors import StemmapError
 
 # Version of the tables, in the header of the file (PRAGMA user_version).
-VERSION = 9
+VERSION = 10
 
 
 def _prepare_tables(connection: sa.Connection) -> None:
-    """Create the tables of an empty database, or complete those of the version before, and store VERSION.
+    """Create the tables of an empty database, or complete those of versions 8 and 9, and store VERSION.
 
     Raises:
         StemmapError: The tables are of another version or of another program.
     """
     version = int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
-    if version == 8:  # annotations are work of people: a column that may be empty is added
-        connection.exec_driver_sql("ALTER TABLE annotations ADD COLUMN reach FLOAT")
+    if version in (8, 9):  # annotations are work of people: columns that may be empty are added
+        for column in ("reach FLOAT", "dbh_who VARCHAR(60)")[version - 8 :]:
+            connection.exec_driver_sql(f"ALTER TABLE annotations ADD COLUMN {column}")
         connection.exec_driver_sql(f"PRAGMA user_version = {VERSION}")
         version = VERSION
     if not version and not sa.inspect(connection).get_table_names():
@@ -156,6 +157,7 @@ annotated = sa.Table(
     sa.Column("plot", sa.JSON(none_as_null=True), comment="further values of a class"),
     sa.Column("reach", sa.Float, comment="[m], see Content"),
     sa.Column("who", sa.String(60), nullable=False),
+    sa.Column("dbh_who", sa.String(60), comment="author of the DBH, see Annotation"),
     sa.Column("at_ns", sa.BigInteger, nullable=False),
     sa.Column("version", sa.Integer, nullable=False),
     sa.Column("deleted", sa.Boolean, nullable=False),

@@ -53,8 +53,8 @@ class Content:
             fields of `Repair`, and of classes of extensions; None for KINDS and SKIPPED.
         reach: Distance below which a rejection can be about a mapped tree [m], because trees beyond were
             other ones when it was made; None if no other one was near, see `run_edits.reach_at`.
-        who: Author of a content that is stored, if it is not the author of the edit, as in an imported table;
-            else empty. Contents that are read have their author in `Annotation`.
+        who, dbh_who: Authors of a content that is stored and of its DBH, if they are not the author of the
+            edit, as in an imported table; else empty. Contents that are read have theirs in `Annotation`.
     """
 
     x: float
@@ -64,6 +64,7 @@ class Content:
     values: dict[str, Any] | None = None
     reach: float | None = None
     who: str = field(default="", compare=False)
+    dbh_who: str = field(default="", compare=False)
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:
@@ -103,13 +104,16 @@ class Annotation:
     Attributes:
         id: Permanent identifier, also after a deletion was undone.
         content: Position, class and DBH.
-        who, at_ns: Author and time of the last edit.
+        who: Author of the last edit that did more than to change the DBH.
+        dbh_who: Author of the DBH; empty without one.
+        at_ns: Time of the last edit.
         version: Number of edits.
     """
 
     id: int
     content: Content
     who: str
+    dbh_who: str
     at_ns: int
     version: int
 

@@ -134,6 +134,8 @@ _LONGEST_KEY = 600
 
 
 MOST_LISTED = 500
+# The page shows places and diameters with 0.1 mm, and returns them so.
+_ROUNDED_M = 0.0001
 # Time during which a deletion can be undone.
 _KEPT_NS = 30 * 86_400 * 1_000_000_000
 # Changes of the same parameters by one person within this time count as one change (a slider drag).
@@ -437,7 +439,7 @@ class Store:
         query = select(_annotations).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
         with self._engine.begin() as connection:
             rows = connection.execute(query.order_by(_annotations.c.id)).all()
-        return [Annotation(row.id, _content(row), row.who, row.at_ns, row.version) for row in rows]
+        return [_annotation(row) for row in rows]
 
     def contents(self, source: str, kind: str = "") -> list[Content]:
         """Return the contents of the annotations of a source that are not deleted, in the order of their
@@ -557,7 +559,7 @@ class Store:
                 raise StemmapError(f"a run may have {MOST_ANNOTATIONS} annotations")
             frame = _frame(connection, run)
             if frame is not None and any(content.kind == FRAME for content in added):
-                raise _stale(frame)
+                raise _stale(connection, frame)
             rows = [
                 (_to_change(connection, run, id_, version, content), content)
                 for id_, version, content in changed
@@ -610,8 +612,7 @@ class Store:
                 if change.before is None or deleted_since or row.deleted != (change.after is None):
                     continue
                 after = None if change.after is None else _as_content(change.after)
-                now = Annotation(row.id, _content(row), row.who, row.at_ns, row.version)
-                found.append((now, _as_content(change.before), after))
+                found.append((_annotation(row), _as_content(change.before), after))
         return found
 
     def undo(self, run: int, author: Author, subjects: Sequence[str] = ()) -> None:
@@ -679,7 +680,7 @@ class Store:
             author: Author of the edit.
             content: Content of the annotation.
         """
-        stored = _columns(content, content.who or author.who)
+        stored = _columns(content, *_authors(None, content, author))
         edit = {"at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
         id_ = _inserted(connection, insert(_annotations).values(run=run, **stored, **edit))
         values = {
@@ -708,8 +709,8 @@ class Store:
         values = {
             "step": step,
             "annotation": row.id,
-            "before": None if row.deleted else _columns(_content(row), row.who),
-            "after": None if content is None else _columns(content, content.who or author.who),
+            "before": None if row.deleted else _columns(_content(row), row.who, row.dbh_who),
+            "after": None if content is None else _columns(content, *_authors(row, content, author)),
             "made_before": row.made_by,
         }
         change = _inserted(connection, insert(_changes).values(**values))
@@ -728,7 +729,7 @@ class Store:
             by: Number of the change that led to the content.
         """
         edit = {"at_ns": self._clock(), "version": row.version + 1, "made_by": by}
-        values = {"who": who, **edit, "deleted": content is None, **(content or {})}
+        values = {"who": who, "dbh_who": None, **edit, "deleted": content is None, **(content or {})}
         connection.execute(update(_annotations).where(_annotations.c.id == row.id).values(**values))
 
     # --- back and forth --------------------------------------------------------------------------
@@ -765,12 +766,13 @@ class Store:
                 content, by = (change.before, change.made_before) if back else (change.after, change.id)
                 who = None if content is None else _author_of(connection, by)
                 self._put(connection, who or author.who, row, content, by)
+            error = None if stale is None else _stale(connection, stale)
         if own:
             raise StaleError(
                 "a later edit of yours changed the same annotation", remedy="Undo that edit first, in its tab"
             )
-        if stale is not None:  # not earlier: the skip of the step must persist
-            raise _stale(stale)
+        if error is not None:  # not earlier: the skip of the step must persist
+            raise error
 
 
 def _request_of(connection: Connection, run: Row[Any]) -> SourceRequest:
@@ -848,7 +850,7 @@ def _to_change(connection: Connection, run: int, id_: int, version: int, content
     if row is None or (content is not None and (content.values is None) != (row.plot is None)):
         raise UnknownError("there is no such annotation", where=f"annotation {id_}")
     if row.version != version or (row.deleted and content is None):
-        raise _stale(row)
+        raise _stale(connection, row)
     return row
 
 
@@ -865,11 +867,31 @@ def _frame(connection: Connection, run: int) -> Row[Any] | None:
     ).one_or_none()
 
 
-def _columns(content: Content, who: str) -> dict[str, Any]:
-    """Return a content and its author as values of the columns of annotations, as they are also stored in
-    changes; older changes have no author there, see `_author_of`."""
+def _authors(row: Row[Any] | None, content: Content, author: Author) -> tuple[str, str | None]:
+    """Return the authors of a new content and of its DBH: an edit of the DBH alone leaves the class its
+    author, and an edit of the class leaves the DBH its own.
+
+    Args:
+        row: Present row of the annotation; None if it is added.
+        content: The new content.
+        author: Author of the edit.
+    """
+    who, dbh_who = content.who or author.who, content.dbh_who or content.who or author.who
+    if row is not None and not row.deleted:
+        if content.dbh is not None and row.dbh is not None and abs(row.dbh - content.dbh) <= _ROUNDED_M:
+            dbh_who = row.dbh_who or row.who
+        moved = max(abs(content.x - row.x), abs(content.y - row.y))
+        if moved <= _ROUNDED_M and (content.kind, content.values) == (row.kind, row.plot):
+            who = row.who
+    return who, None if content.dbh is None else dbh_who
+
+
+def _columns(content: Content, who: str, dbh_who: str | None) -> dict[str, Any]:
+    """Return a content and its authors as values of the columns of annotations, as they are also stored in
+    changes; older changes have no authors there, see `_author_of`."""
     return {
         "who": who,
+        "dbh_who": dbh_who,
         "x": content.x,
         "y": content.y,
         "kind": content.kind,
@@ -877,6 +899,12 @@ def _columns(content: Content, who: str) -> dict[str, Any]:
         "plot": content.values,
         "reach": content.reach,
     }
+
+
+def _annotation(row: Row[Any]) -> Annotation:
+    """Return the annotation of a row; in older tables the author is also that of the DBH."""
+    dbh_who = "" if row.dbh is None else row.dbh_who or row.who
+    return Annotation(row.id, _content(row), row.who, dbh_who, row.at_ns, row.version)
 
 
 def _content(row: Row[Any]) -> Content:
@@ -921,12 +949,12 @@ def _is_of_a_later_step(connection: Connection, row: Row[Any], author: Author) -
     return step is not None and step.browser == author.browser and step.state == "done"
 
 
-def _stale(row: Row[Any]) -> StaleError:
+def _stale(connection: Connection, row: Row[Any]) -> StaleError:
     """Return the error of an edit of an annotation that was changed or deleted meanwhile; `row` is its
     present row."""
     done = "deleted" if row.deleted else "changed"
+    who = _author_of(connection, row.made_by) or row.who
     return StaleError(
-        f"the annotation ({row.kind}) at {row.x:.2f}, {row.y:.2f} was {done} by {row.who} "
-        f"at {moment(row.at_ns)}",
+        f"the annotation ({row.kind}) at {row.x:.2f}, {row.y:.2f} was {done} by {who} at {moment(row.at_ns)}",
         remedy="Your edit was not saved; check the current state and try again",
     )

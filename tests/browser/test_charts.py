@@ -71,6 +71,27 @@ def test_quantities_are_chosen_have_one_cursor_and_a_click_goes_there(dashboard:
     page.locator("#chart-choice").select_option("distance")
 
 
+def test_a_curve_is_not_drawn_over_a_silence(dashboard: Dashboard):
+    page = dashboard.page
+    times = [0.0, 0.1, 0.2, 0.3, 4.0, 4.1, 4.2]
+    course = {
+        "scans": list(range(7)), "time_s": times, "values": {"trees": [1, 1, 2, 2, 3, 3, 3]}, "stages": {},
+        "quantities": {"trees": {"title": "trees", "unit": ""}},
+    }  # fmt: skip
+    page.route("**/api/course*", lambda route: route.fulfill(json=course))
+    page.evaluate("() => localStorage.setItem('stemmap.quantities', 'trees')")
+    page.reload()
+    dashboard.tab("Charts")
+    page.locator("#chart-choice").select_option("quantities")
+    dashboard.until(f"() => ({DRAWN})()?.times.length === 8")
+    curve = page.evaluate("() => document.getElementById('chart').data[0]")
+    assert curve["x"] == [*times[:4], 0.3, *times[4:]]
+    assert curve["y"] == [1, 1, 2, 2, None, 3, 3, 3]
+    assert curve["mode"] == "lines"
+    page.unroute("**/api/course*")
+    page.locator("#chart-choice").select_option("distance")
+
+
 # Events as of a live run, whose clock is known.
 LOGGED = """async (live) => {
   const { state, changed } = await import('/static/js/core/store.js');

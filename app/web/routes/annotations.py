@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,6 +25,7 @@ from app.dashboard.annotations import (
     import_plan,
     is_doubtful_dbh,
     row_payload,
+    usual_dbh,
 )
 from app.dashboard.dashboard import Dashboard
 from app.store.records import (
@@ -54,8 +55,8 @@ router = APIRouter(prefix="/api")
 _LARGEST_DBH_M = 10.0
 _AT_TREE_M = 0.1  # an answer is given at the tree, which moves in a live map until it arrives
 _FEW_DIAMETERS = 3  # of a table and of the map, whose median tells the unit
-_MOST_NAMED = 3  # contradictions, replacements and doubts of an import that are named
-_Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited", "tree")
+_MOST_NAMED = 500  # contradictions, replacements and doubts of an import that are named, each
+_Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "dbh_who", "edited", "tree")
 
 
 class _AddAnnotation(Edit):
@@ -189,17 +190,17 @@ async def redo(body: _Turn, dashboard: Dash) -> Response:
 @router.post("/annotations/import")
 async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     """Add the rows of a CSV table, and the diameters that annotations lack, in one edit, see `import_plan`.
-    The author of each is that of the row in a column `who`, else the import ("import of plot.csv"), also
-    where an annotation of the author of the row changes.
+    The author of each is that of the row in a column `who`, and of its diameter that in a column `dbh_who`,
+    else the import ("import of plot.csv"), also where an annotation of the author of the row changes.
 
     Return the number of added annotations (`added`), of diameters added to others (`filled`), of annotations
     whose class or diameter is replaced (`replaced`), of rows that exist already as annotations or earlier in
     the table (`left_out`), and of rows that are left out because they contradict an annotation (`differing`),
-    with the first of these, of what is replaced (`replacements`), and of the doubtful diameters (`doubts`, in
-    all `doubtful`) as text; of rows that are not exactly at the place of their
-    annotation (`beside`), with the smallest and the largest distance (`beside_m`); and the counts of edits,
-    see `edited`. 422 if the table cannot be read or has too many rows or rows with faults, of which the first
-    10 are named, 409 as in `add`; then nothing is stored. Without anything new there is no edit."""
+    with the first _MOST_NAMED of these (`differences`), of what is replaced (`replacements`), and of the
+    doubtful diameters (`doubts`, in all `doubtful`) as text; of rows that are not exactly at the place of
+    their annotation (`beside`), with the smallest and the largest distance (`beside_m`); and the counts of
+    edits, see `edited`. 422 if the table cannot be read or has too many rows or rows with faults, of which
+    the first 10 are named, 409 as in `add`; then nothing is stored. Without anything new there is no edit."""
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
     contents, has_diameters = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
@@ -210,11 +211,13 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     )
     changed = [*plan.filled, *plan.replaced]
     before = {row.id: row.content for row in dashboard.annotation_editor.rows}
+    name_of = _namer(dashboard)
     replacements = [
-        _replacement(dashboard, before[number], content)
+        _replacement(name_of(before[number]), before[number], content)
         for number, _, content in plan.replaced[:_MOST_NAMED]
         if content is not None
     ]
+    differences = [_difference(name_of(here), here, there) for here, there in plan.conflicts[:_MOST_NAMED]]
     added = [replace(each, reach=_reach_at(dashboard, each.x, each.y)) for each in plan.added]
     if added or changed:
         await apply_edit(dashboard, body, Store.edit, added, changed)
@@ -225,7 +228,7 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
         "replaced": len(plan.replaced),
         "left_out": plan.repeated,
         "differing": len(plan.conflicts),
-        "differences": [_difference(dashboard, *pair) for pair in plan.conflicts[:_MOST_NAMED]],
+        "differences": differences,
         "replacements": replacements,
         "doubtful": len(doubts),
         "doubts": doubts[:_MOST_NAMED],
@@ -337,13 +340,17 @@ def _tree_numbers(dashboard: Dashboard) -> dict[Content, int]:
     return {contents[k]: numbers[row] for row, k in of_tree.items()}
 
 
-def _name(dashboard: Dashboard, content: Content) -> str:
-    """Return what people call the thing of an annotation: its tree, else its place."""
-    number = _tree_numbers(dashboard).get(content)
-    x, y = dashboard.offset
-    return (
-        f"the annotation at {content.x + x:.2f}, {content.y + y:.2f}" if number is None else f"tree {number}"
-    )
+def _namer(dashboard: Dashboard) -> Callable[[Content], str]:
+    """Return a function that returns what people call the thing of an annotation: its tree in the map of the
+    shown scan, else its place."""
+    numbers, (x, y) = _tree_numbers(dashboard), dashboard.offset
+
+    def name_of(content: Content) -> str:
+        number = numbers.get(content)
+        place = f"{content.x + x:.2f}, {content.y + y:.2f}"
+        return f"the annotation at {place}" if number is None else f"tree {number}"
+
+    return name_of
 
 
 def _dbh_text(dbh: float | None) -> str:
@@ -351,20 +358,25 @@ def _dbh_text(dbh: float | None) -> str:
     return "no DBH" if dbh is None else f"{100.0 * dbh:.2f}".rstrip("0").rstrip(".") + " cm"
 
 
-def _difference(dashboard: Dashboard, here: Content, there: Content) -> str:
-    """Return how a row of a table (`there`) contradicts the annotation at its place."""
-    name = _name(dashboard, here)
+def _range_text(dbh: tuple[float, float]) -> str:
+    """Return a range of diameters [m] for people."""
+    return f"{100.0 * dbh[0]:.0f} to {100.0 * dbh[1]:.0f} cm"
+
+
+def _difference(name: str, here: Content, there: Content) -> str:
+    """Return how a row of a table (`there`) contradicts the annotation at its place, which people call
+    `name`."""
     if here.kind != there.kind:
         return f"{name} is {here.kind} here, {there.kind} in the file"
     return f"{name} has DBH {_dbh_text(here.dbh)} here, {_dbh_text(there.dbh)} in the file"
 
 
-def _replacement(dashboard: Dashboard, before: Content, after: Content) -> str:
-    """Return how a row of a table changes the annotation that it replaces."""
+def _replacement(name: str, before: Content, after: Content) -> str:
+    """Return how a row of a table changes the annotation that it replaces, which people call `name`."""
     was, now = (
         (before.kind, after.kind) if before.kind != after.kind else map(_dbh_text, (before.dbh, after.dbh))
     )
-    return f"{_name(dashboard, before)}: {was} -> {now}"
+    return f"{name}: {was} -> {now}"
 
 
 def _doubts(dashboard: Dashboard, contents: Sequence[Content]) -> list[str]:
@@ -374,11 +386,14 @@ def _doubts(dashboard: Dashboard, contents: Sequence[Content]) -> list[str]:
         return []
     trees, doubts = dashboard.shown.frame.trees, list[str]()
     rows = np.flatnonzero(trees.confirmed)
+    usual = usual_dbh(trees.dbh[rows])
     for k, of in annotation_of_tree(trees.position[rows], contents).items():
         row, dbh = rows[k], contents[of].dbh
         mapped, sigma = float(trees.dbh[row]), float(trees.dbh_sigma[row])
-        if dbh is not None and is_doubtful_dbh(dbh, mapped, sigma):
-            here = f"{_dbh_text(mapped)} in the map" if math.isfinite(mapped) else "none in the map"
+        if dbh is not None and is_doubtful_dbh(dbh, mapped, sigma, usual):
+            here = f"{_dbh_text(mapped)} in the map"
+            if not math.isfinite(mapped):
+                here = f"none in the map; usual are {_range_text(usual)}"
             doubts.append(f"tree {trees.number[row]} has {_dbh_text(dbh)}, {here}")
     return doubts
 
@@ -387,8 +402,8 @@ def _feature(row: dict[str, Any]) -> dict[str, Any]:
     """Return an annotation, see `_rows`, as a GeoJSON feature (dict): a point at x, y with the `id` of the
     annotation and the properties `class`, `dbh_cm`, `who`, `edited` (time as text) and `tree`."""
     properties = {
-        "class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"], "edited": _when(row),
-        "tree": row["tree"],
+        "class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"],
+        "dbh_who": row["dbh_who"] or None, "edited": _when(row), "tree": row["tree"],
     }  # fmt: skip
     geometry = {"type": "Point", "coordinates": [row["x"], row["y"]]}
     return {"type": "Feature", "id": row["id"], "geometry": geometry, "properties": properties}
@@ -398,7 +413,16 @@ def _row(row: dict[str, Any]) -> list[str]:
     """Return an annotation, see `_rows`, as the cells of `_Columns`; the DBH is "" if it is unknown."""
     dbh = "" if row["dbh_cm"] is None else f"{row['dbh_cm']:.2f}"
     tree = "" if row["tree"] is None else str(row["tree"])
-    return [f"{row['x']:.4f}", f"{row['y']:.4f}", dbh, row["kind"], row["who"], _when(row), tree]
+    return [
+        f"{row['x']:.4f}",
+        f"{row['y']:.4f}",
+        dbh,
+        row["kind"],
+        row["who"],
+        row["dbh_who"],
+        _when(row),
+        tree,
+    ]
 
 
 def _when(row: dict[str, Any]) -> str:
@@ -412,8 +436,9 @@ def _faults(content: Content) -> Iterator[SourceError]:
         yield SourceError(f"it is farther than {FARTHEST_M:,.0f} m from the origin")
     if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
         yield SourceError(f"the DBH is {content.dbh:.1f} m", remedy="Check the unit of the diameter")
-    if content.who and not is_user_name(content.who):
-        yield SourceError(f"who = {content.who[:60]!r} is not a name")
+    for name in (content.who, content.dbh_who):
+        if name and not is_user_name(name):
+            yield SourceError(f"who = {name[:60]!r} is not a name")
 
 
 def _check_unit(trees: Trees, contents: list[Content]) -> None:
@@ -459,7 +484,8 @@ def _imported(
             raise SourceError(f"a run can have at most {MOST_ANNOTATIONS} annotations")
         trees = truth_in_metres(truth_trees_of(table, faults, dbh_unit=body.dbh_unit), unit, offset)
         placed = contents_of(replace(trees, x=trees.x - offset[0], y=trees.y - offset[1]))
-        contents = [replace(each, who=who) for each, who in zip(placed, table.text("who"), strict=True)]
+        authors = zip(placed, table.text("who"), table.text("dbh_who"), strict=True)
+        contents = [replace(each, who=who, dbh_who=dbh_who) for each, who, dbh_who in authors]
         diameters = table.find(DBH_COLUMNS)
         if body.replaces and (kind := table.find(KIND_COLUMNS)) is not None:
             faults += _empty_classes(table, kind)

@@ -1,6 +1,7 @@
 // Annotations: what a person states about trees. Edits go to the server one at a time and come back to all browsers.
 
 import { get, put, request } from "../core/api.js";
+import { placeTexts } from "../core/coordinates.js";
 import { byId, randomId, recall, remember } from "../core/dom.js";
 import { capital, count, dbhFigure, share } from "../core/format.js";
 import { select } from "../core/live_feed.js";
@@ -102,7 +103,7 @@ export function edit(work, answer = null) {
       await arrived(done.serial);
       return done;
     } catch (error) {
-      draft.error = answer ? `Tree ${answer.number}: ${error.message}` : error.message; // another card may be shown now
+      draft.error = answer && answer.number !== null ? `Tree ${answer.number}: ${error.message}` : error.message; // another card may be shown now
       if (draft.answer === answer) draft.answer = null; // not that of a later edit
       return null;
     } finally {
@@ -123,7 +124,8 @@ function arrived(serial) {
 // The new annotation is chosen unless another tree was selected meanwhile.
 async function add(content) {
   const before = state.selected;
-  const done = await edit(() => call("POST", "", { kind: "tree", dbh_cm: null, ...content }));
+  const given = { kind: "tree", dbh_cm: null, ...content };
+  const done = await edit(() => call("POST", "", given), { number: null, kind: given.kind, dbh: given.dbh_cm, before: null, place: given });
   if (done && state.selected === before) choose(done.id);
   return done;
 }
@@ -534,7 +536,9 @@ const statement = (kind, dbh) => (dbh === null ? kind : `${kind}, ${dbh} cm`);
 export function answerText() {
   if (!draft.answer) return "";
   const { number, kind, dbh, isStored } = draft.answer;
-  return `Tree ${number}: ${statement(kind, dbh)}${isStored ? ", as before" : ""}${replacedText(draft.answer)}`;
+  if (number === null) return `Added: ${statement(kind, dbh)} at ${placeTexts([draft.answer.place.x, draft.answer.place.y]).join(", ")}`;
+  const mapped = dbh === null ? null : treeOf(number)?.dbh_cm ?? null;
+  return `Tree ${number}: ${statement(kind, dbh)}${mapped === null ? "" : ` (map ${dbhFigure(mapped, treeOf(number).sigma_dbh_cm)})`}${isStored ? ", as before" : ""}${replacedText(draft.answer)}`;
 }
 
 // The answer that this one replaced, with the name of another person.
@@ -543,16 +547,27 @@ function replacedText({ before, kind, dbh, isStored }) {
   return isStored || !isOther || before.kind === SKIPPED ? "" : ` (before: ${statement(before.kind, before.dbh_cm)}${byOther(before)})`;
 }
 
-export const byOther = (row) => (row.who === myName() ? "" : ` by ${row.who}`);
+export const authorsText = ({ who, dbh_who: of }) => (!of || of === who ? who : `${who}, DBH ${of}`);
+export const byOther = (row) => ([row.who, row.dbh_who || row.who].every((who) => who === myName()) ? "" : ` by ${authorsText(row)}`);
 
 // Why a typed DBH [cm] is doubtful, see `is_doubtful_dbh` in app/dashboard/annotations.py; "" if it is not. `tree` is the found tree, null
 // without one.
 export function typedDoubt(tree, dbh) {
   if (dbh === null || !state.annotations) return "";
-  const { sigmas, tape_sigma_cm: own, usual_cm: [least, most] } = state.annotations.doubt;
+  const { sigmas, tape_sigma_cm: own } = state.annotations.doubt;
   const mapped = tree?.dbh_cm ?? null, sigma = tree?.sigma_dbh_cm ?? 0;
   if (mapped !== null) return Math.abs(dbh - mapped) <= sigmas * Math.hypot(sigma, own) ? "" : `The map has ${dbhFigure(mapped, sigma)} cm. Was it typed in cm?`;
-  return dbh >= least && dbh <= most ? "" : `Few stems are ${dbh < least ? `thinner than ${least}` : `thicker than ${most}`} cm. Was it typed in cm?`;
+  const { least, most, isOfMap } = usualDbh();
+  if (dbh >= least && dbh <= most) return "";
+  const [word, limit] = dbh < least ? ["thinner", least] : ["thicker", most];
+  return `${isOfMap ? `No mapped stem is ${word} than ${figure(limit)}` : `Few stems are ${word} than ${limit}`} cm. Was it typed in cm?`;
+}
+
+// The range of diameters [cm] that are not asked about where the map has none, see `usual_dbh` in app/dashboard/annotations.py.
+function usualDbh() {
+  const { usual_cm: [least, most], fewest } = state.annotations.doubt;
+  const mapped = trees().map((tree) => tree.dbh_cm).filter((dbh) => dbh !== null);
+  return mapped.length < fewest ? { least, most, isOfMap: false } : { least: Math.min(...mapped), most: Math.max(...mapped), isOfMap: true };
 }
 
 // --- the chosen annotation -------------------------------------------------------------------------------------

@@ -29,12 +29,15 @@ export const card = (answers, hint) => el("article", { id: "review", class: "rev
   el("div", { class: "review-side" },
     el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" }),
       button("review-story", "Story", "Why the mapping decided so, with the figures behind it", () => openTab("story"), "quiet small")),
-    answers),
+    answers,
+    dbhField()),
   hint);
+
+const dbhField = () =>
+  el("label", { id: "review-tape", class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, el("span", { id: "review-dbh-title" }), " ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" }));
 
 // What else is known of the tree.
 export const moreEvidence = () => el("section", { id: "review-more", class: "review-more", "aria-label": "Further evidence on the tree" },
-  el("label", { class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, el("span", { id: "review-dbh-title" }), " ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" })),
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
@@ -204,7 +207,7 @@ function showReady() {
 export function fillCard() {
   const tree = selectedTree();
   byId("review").classList.toggle("empty-card", !tree);
-  byId("review-more").hidden = !tree;
+  for (const id of ["review-more", "review-tape"]) byId(id).hidden = !tree;
   byId("review-refused").hidden = !tree || !draft.refused || !draft.isRefusalShown;
   setText(byId("review-refused"), draft.refused);
   if (!tree) {

@@ -15,13 +15,13 @@ import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answerBeside, answeredTrees, answerText, byClick, byOther, callMe, change, choose, contradicting, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, typedDoubt, unreviewed, votesText, withoutTree } from "./annotations.js";
+import { annotating, annotationOf, answerBeside, answeredTrees, answerText, authorsText, byClick, byOther, callMe, change, choose, contradicting, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, typedDoubt, unreviewed, votesText, withoutTree } from "./annotations.js";
 import { card, fillCard, moreEvidence, startCard, typeDbh } from "./card.js";
 import { startSection } from "./section.js";
 
 const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
 const EVERY = 300; // [ms] between two updates while a run plays
-const SHOWN_ANSWERS = 5, MOST_LISTED = 12;
+const SHOWN_ANSWERS = 5, MOST_LISTED = 12, MOST_NAMED = 3;
 const LARGEST_TABLE = 900_000; // [bytes]
 const lines = new Map(); // rows of the table by the id of the annotation
 const { undo, redo, canUndo, canRedo } = reviewHistory;
@@ -74,6 +74,7 @@ function build() {
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised. A row is listed under the name in a column who, as in saved tables, else as an import of the file", () => file.click()), unit,
       el("label", { title: "For a table that was saved here and corrected elsewhere: its class and DBH replace those of the annotation at the same place; an emptied DBH removes the one here. Otherwise rows that differ are left out and named" }, replaces, " replace what differs"), file,
       truthLink("csv", "CSV"), truthLink("geojson", "GeoJSON")),
+    el("details", { id: "annotate-imported", class: "annotate-imported", hidden: true }),
     ...ofExtensions("annotateSections"));
 }
 
@@ -109,13 +110,28 @@ async function take(file, unit, replaces) {
   const done = await importTable(await file.text(), file.name, unit, replaces);
   const more = confirmed() - before;
   if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced (${listed(done.replacements, done.replaced)})` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}${done.doubtful ? `; check ${count(done.doubtful, "diameter")}: ${listed(done.doubts, done.doubtful)}` : ""}.`;
-  if (done) showDone(imported);
+  if (done) {
+    fillImported(done, file.name);
+    showDone(imported);
+  }
   else showProblem(draft.error); // the button is below the list, the error above it
   fill();
 }
 
 // The first ones of a number of texts.
-const listed = (texts, number) => `${texts.join("; ")}${number > texts.length ? `; and ${number - texts.length} more` : ""}`;
+function listed(texts, number) {
+  const named = texts.slice(0, MOST_NAMED);
+  return `${named.join("; ")}${number > named.length ? `; and ${number - named.length} more` : ""}`;
+}
+
+// All that the last import has replaced, left out or asks about.
+function fillImported({ replacements, replaced, differences, differing, doubts, doubtful }, name) {
+  const groups = [["Replaced", replacements, replaced], ["Left out, because it differs", differences, differing], ["Diameters to check", doubts, doubtful]].filter(([, texts]) => texts.length);
+  const box = byId("annotate-imported");
+  box.hidden = !groups.length;
+  box.replaceChildren(el("summary", { text: `Import of ${name}: ${groups.map(([title, , number]) => `${title.toLowerCase()} ${number}`).join("; ")}` }),
+    ...groups.flatMap(([title, texts, number]) => [el("p", { text: `${title}:` }), el("ul", {}, ...texts.map((text) => el("li", { text })), number > texts.length ? el("li", { text: `and ${number - texts.length} more` }) : "")]));
+}
 
 function differingText({ differing, differences }) {
   if (!differing) return "";
@@ -178,8 +194,8 @@ function show(line, row) {
   line.dbh.placeholder = mapped === null ? NONE : `mapped ${figure(mapped)}`;
   setText(tree, String(treeNumberOf(row) ?? NONE));
   placeTexts([place.x, place.y]).forEach((text, axis) => setText([x, y][axis], text));
-  setText(who, row.who);
-  who.title = `${row.who}, ${new Date(1000 * row.at_s).toLocaleString()}`;
+  setText(who, authorsText(row));
+  who.title = `${authorsText(row)}, ${new Date(1000 * row.at_s).toLocaleString()}`;
   line.node.setAttribute("aria-selected", String(row.id === draft.chosen));
 }
 
@@ -238,7 +254,7 @@ function fillRows(box, annotations) {
   box.dataset.now = now;
   box.replaceChildren(...shown.map((row) => {
     const number = treeNumberOf(row), place = placeTexts([row.x, row.y]).join(", ");
-    return el("button", { class: "quiet small", type: "button", "aria-pressed": String(row.id === draft.chosen), text: `${number === null ? `at ${place}` : number} ${row.kind}`, title: `Select it: ${row.kind} by ${row.who} at ${place}`, onclick: () => { choose(row.id); showCard(); } });
+    return el("button", { class: "quiet small", type: "button", "aria-pressed": String(row.id === draft.chosen), text: `${number === null ? `at ${place}` : number} ${row.kind}`, title: `Select it: ${row.kind} by ${authorsText(row)} at ${place}`, onclick: () => { choose(row.id); showCard(); } });
   }), more ? el("span", { text: `and ${more} more` }) : "");
 }
 

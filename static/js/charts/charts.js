@@ -14,6 +14,7 @@ import { saveLog, showLog } from "./log.js";
 
 const EVERY = 2000; // [ms] between two updates
 const CURSOR_EVERY = 200; // [ms] between two moves of the cursor
+const SILENT = 1; // [s] without a scan that are a silence
 const LONGEST = 1200; // samples drawn of each curve
 const MOST_APART = 24; // trees whose cells have a gap; the gaps of more are drawn unevenly
 const ROW = 120; // [px] of height that a curve of its own needs
@@ -103,7 +104,7 @@ async function curves(wanted) {
     figure.annotations.push({ text: `${title}${unit && `, ${unit}`}`, showarrow: false, xref: "paper", x: 0, xanchor: "left", yref: "paper", y: top, yanchor: "bottom" });
   });
   Object.assign(figure.xaxis, { title: { text: TIME }, anchor: names.length > 1 ? `y${names.length}` : "y", showspikes: true, spikemode: "across", spikethickness: 1, spikedash: "dot", spikecolor: colour("dim") });
-  return [names.map((name, place) => ({ ...line(time, values[name], quantities[name].title), yaxis: place ? `y${place + 1}` : "y" })), figure];
+  return [names.map((name, place) => ({ ...brokenAtSilences(line(time, values[name], quantities[name].title)), yaxis: place ? `y${place + 1}` : "y" })), figure];
 }
 
 // The current scan as a line over all curves.
@@ -116,6 +117,14 @@ const moveCursor = throttled(() => {
 }, CURSOR_EVERY);
 
 const line = (x, y, name) => ({ type: "scatter", mode: y.includes(null) ? "lines+markers" : "lines", marker: { size: 4 }, x, y, name, line: { width: 1.5 }, hovertemplate: `%{y:.3~r}<extra>${name}</extra>` });
+
+// A curve is not drawn over a silence, see `_note_silences` in app/dashboard/events.py; of a long run not each scan is drawn.
+function brokenAtSilences(curve) {
+  const steps = curve.x.slice(1).map((time, k) => time - curve.x[k]), usual = steps.toSorted((a, b) => a - b)[Math.floor(steps.length / 4)];
+  const ends = steps.flatMap((step, k) => (step > Math.max(SILENT, 2 * usual) ? [k + 1] : [])), parts = [0, ...ends].map((from, k) => [from, ends[k]]);
+  const joined = (values, between) => parts.flatMap(([from, to]) => [...(from ? [between(from)] : []), ...values.slice(from, to)]);
+  return { ...curve, x: joined(curve.x, (from) => curve.x[from - 1]), y: joined(curve.y, () => null) };
+}
 
 // --- choice of the quantities ------------------------------------------------------------------
 
@@ -195,7 +204,7 @@ function saveTable() {
   if (chart.hidden || !chart.data) return;
   const [first] = chart.data;
   const rows = first.type === "heatmap" ? [["tree", ...first.x], ...first.z.map((row, k) => [first.y[k], ...row])]
-    : [["time_s", "curve", "value"], ...chart.data.flatMap(({ x, y, name }) => x.map((time, k) => [time, name, y[k]]))];
+    : [["time_s", "curve", "value"], ...chart.data.flatMap(({ x, y, name }) => x.flatMap((time, k) => (y[k] === null && time === x[k - 1] ? [] : [[time, name, y[k]]])))];
   saveCsv(`${chart.dataset.kind}.csv`, rows);
 }
 

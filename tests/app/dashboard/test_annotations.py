@@ -26,8 +26,10 @@ from app.dashboard.annotations import (
     carried_by,
     counted,
     import_plan,
+    is_doubtful_dbh,
     laid_over,
     truth_of,
+    usual_dbh,
 )
 from app.dashboard.dashboard import Dashboard
 from app.store.async_store import LARGEST_QUEUE, AsyncStore, StoreBusyError
@@ -46,6 +48,7 @@ from tests.pipeline.strategies import trees
 
 ANN = {"browser": "a" * 16, "who": "Ann"}
 BOB = {"browser": "b" * 16, "who": "Bob"}
+EVE = {"browser": "e" * 16, "who": "Eve"}
 
 
 @pytest_asyncio.fixture
@@ -226,7 +229,7 @@ async def test_a_table_goes_in_and_comes_out(both: Running, tmp_path: Path) -> N
     (tmp_path / "truth.csv").write_text(out.text)
     read = contents_of(read_truth_trees(tmp_path / "truth.csv"))
     assert read == [Content(1.5, 2.5, "tree", 0.31), Content(3.0, 4.0, "pole", None)]
-    assert out.text.splitlines()[0] == "x_m,y_m,dbh_cm,class,who,edited,tree"
+    assert out.text.splitlines()[0] == "x_m,y_m,dbh_cm,class,who,dbh_who,edited,tree"
     told = json.loads((await client.get("/api/annotations.geojson")).text)
     assert told["coordinateFrame"]["type"] == "local"
     assert [f["geometry"]["coordinates"] for f in told["features"]] == [[1.5, 2.5], [3.0, 4.0]]
@@ -259,7 +262,7 @@ async def test_a_row_that_contradicts_an_annotation_is_left_out_and_named(both: 
     # Rows of one table that contradict each other; a few are named.
     many = "x_m,y_m,class\n" + "".join(f"{90 + n},0,tree\n{90 + n},0,pole\n" for n in range(5))
     within = (await edit(client, "POST", "/import", table=many)).json()
-    assert (within["added"], within["differing"], len(within["differences"])) == (5, 5, 3)
+    assert (within["added"], within["differing"], len(within["differences"])) == (5, 5, 5)
 
 
 async def test_an_imported_dbh_fills_the_annotation_and_is_undone_with_the_import(both: Running) -> None:
@@ -407,7 +410,7 @@ async def test_an_import_names_what_it_replaces_and_which_diameters_are_doubtful
     assert answer["doubtful"] == 2
     assert answer["doubts"] == [
         f"tree {numbers[0]} has 222 cm, 22.2 cm in the map",
-        f"tree {numbers[1]} has 0.34 cm, none in the map",
+        f"tree {numbers[1]} has 0.34 cm, none in the map; usual are 3 to 150 cm",
     ]
     right = table.replace("222.0", "22.2").replace("0.34,tree", ",pole")
     answer = (await edit(client, "POST", "/import", table=right, replaces=True)).json()
@@ -417,31 +420,74 @@ async def test_an_import_names_what_it_replaces_and_which_diameters_are_doubtful
     ]  # fmt: skip
 
 
-async def test_an_imported_row_has_the_author_of_its_table_else_the_name_of_the_file(both: Running) -> None:
+@pytest.mark.parametrize(
+    ("mapped", "dbh", "doubtful"),
+    [
+        ([0.2, 0.4], 1.2, False), ([0.2, 0.4], 0.02, True),  # too few to tell the range of the stand
+        (np.linspace(0.1, 0.4, 9), 0.98, True), (np.linspace(0.1, 0.4, 9), 0.098, True),
+        ([*np.linspace(0.1, 0.4, 9), np.nan], 0.39, False),
+    ],
+)  # fmt: skip
+def test_a_dbh_beyond_those_of_the_stand_is_doubtful_where_the_map_has_none(mapped, dbh, doubtful) -> None:
+    usual = usual_dbh(np.array(mapped))
+    assert is_doubtful_dbh(dbh, np.nan, np.nan, usual) == doubtful
+    assert not is_doubtful_dbh(dbh, dbh, 0.01, usual)
+
+
+async def test_class_and_dbh_have_the_authors_of_the_table_else_the_name_of_the_file(both: Running) -> None:
     client, _ = both
 
-    async def authors() -> list[str]:
-        return [row["who"] for row in await rows(client)]
+    async def authors() -> list[tuple[str, str]]:
+        return [(row["who"], row["dbh_who"]) for row in await rows(client)]
 
     await edit(client, "POST", x=1.0, y=2.0)
     await edit(client, "POST", x=3.0, y=2.0)
     table = "x_m,y_m,dbh_cm,class,who\n1,2,26.4,tree,Ann\n3,2,30,tree,Eve\n7,8,31,tree,Eve\n9,8,31,tree,\n"
     await edit(client, "POST", "/import", table=table, file="plot (2).csv")
     imported = "import of plot _2_.csv"
-    # Ann has not measured her tree here: her annotation was changed by the import.
-    assert await authors() == [imported, "Eve", "Eve", imported]
+    # Ann has seen both of her trees, but has not measured them here.
+    filled = [("Ann", imported), ("Ann", "Eve")]
+    added = [("Eve", "Eve"), (imported, imported)]
+    assert await authors() == filled + added
     number = (await rows(client))[2]["id"]
     await edit(client, "PATCH", f"/{number}", version=1, x=7.0, y=8.0, kind="pole")
-    assert await authors() == [imported, "Eve", "Ann", imported]
-    for where, expected in (("undo", "Eve"), ("undo", None), ("redo", "Eve"), ("redo", "Ann")):
+    corrected = [("Ann", ""), (imported, imported)]
+    assert await authors() == filled + corrected
+    alone = [("Ann", ""), ("Ann", "")]
+    for where, expected in (
+        ("undo", filled + added), ("undo", alone), ("redo", filled + added), ("redo", filled + corrected),
+    ):  # fmt: skip
         await edit(client, "POST", f"/{where}")
-        known = await authors()
-        assert known[2:3] == ([] if expected is None else [expected])
-        assert known[:2] == (["Ann", "Ann"] if expected is None else [imported, "Eve"])
+        assert await authors() == expected
     out = (await client.get("/api/annotations.csv")).text.splitlines()
-    assert [line.split(",")[4] for line in out[1:]] == [imported, "Eve", "Ann", imported]
+    assert [tuple(line.split(",")[4:6]) for line in out[1:]] == filled + corrected
     await edit(client, "POST", "/import", table="x_m,y_m\n50,50\n", file="")
-    assert (await authors())[-1] == "import"
+    assert (await authors())[-1] == ("import", "")
+    # A saved table that was corrected elsewhere: its authors are those of what was there before.
+    table = "\n".join(out).replace("26.40", "27.40") + "\n"
+    await edit(client, "POST", "/import", table=table, file="mended.csv", replaces=True)
+    assert (await authors())[:4] == [("Ann", "import of mended.csv"), *filled[1:], *corrected]
+
+
+async def test_the_dbh_keeps_its_author_where_another_person_changes_the_class(both: Running) -> None:
+    client, _ = both
+    number = (await edit(client, "POST", x=1.0, y=2.0)).json()["id"]
+    place = {"x": 1.0, "y": 2.0}
+    assert (await edit(client, "PATCH", f"/{number}", version=1, **place, dbh_cm=31.234, **BOB)).is_success
+    [row] = await rows(client)
+    assert (row["who"], row["dbh_who"], row["dbh_cm"]) == ("Ann", "Bob", 31.23)
+    await edit(client, "PATCH", f"/{number}", version=2, **place, dbh_cm=31.23, kind="pole", **EVE)
+    [row] = await rows(client)
+    assert (row["who"], row["dbh_who"], row["kind"]) == ("Eve", "Bob", "pole")
+    late = await edit(client, "PATCH", f"/{number}", version=1, **place, dbh_cm=9.0)
+    assert late.status_code == 409
+    assert "changed by Eve" in late.text
+    await edit(client, "PATCH", f"/{number}", version=3, **place, kind="pole", **BOB)
+    [row] = await rows(client)
+    assert (row["who"], row["dbh_who"], row["dbh_cm"]) == ("Eve", "", None)
+    late = await edit(client, "PATCH", f"/{number}", version=1, **place, dbh_cm=9.0)
+    assert late.status_code == 409
+    assert "changed by Bob" in late.text
 
 
 async def test_a_body_that_is_too_large_is_refused(both: Running) -> None:
@@ -626,7 +672,7 @@ async def test_a_store_with_a_full_queue_finishes_its_requests_and_closes(is_ope
 
 
 def test_who_asks_for_one_of_two_truths_is_not_told_the_other() -> None:
-    rows = [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", 0, 1)]
+    rows = [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", "", 0, 1)]
     assert truth_of(None, rows, "own") is None
     assert truth_of(truth_trees(), [], "annotations") is None
     assert (counted(None, rows, "both"), counted(None, rows, "annotations")) == ("annotations",) * 2
@@ -644,8 +690,8 @@ def test_merged_trees_of_a_repaired_path_are_found_by_those_that_were_seen_with_
 
 def test_a_rejection_of_a_vanished_tree_neither_follows_nor_decides_a_merge() -> None:
     there = trees(np.array([[0.3, 0.0], [0.9, 0.0]]))
-    gone = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", 0, 1)
-    confirmed = Annotation(2, Content(0.9, 0.0, "tree", 0.31), "Ben", 0, 1)
+    gone = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", "", 0, 1)
+    confirmed = Annotation(2, Content(0.9, 0.0, "tree", 0.31), "Ben", "Ben", 0, 1)
     places = ((0.3, 0.0), (0.9, 0.0))
     changes = carried_by(there, [gone, confirmed], [Repair("merge", places)])
     assert [(id_, content is None) for id_, _, content in changes] == [(2, False)]
@@ -653,10 +699,10 @@ def test_a_rejection_of_a_vanished_tree_neither_follows_nor_decides_a_merge() ->
 
 @pytest.mark.parametrize("replaces", [False, True])
 def test_a_table_changes_only_what_its_rows_are_about(replaces: bool) -> None:
-    rejected = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", 0, 1)
+    rejected = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", "", 0, 1)
     plan = import_plan([rejected], [Content(0.3, 0.0, "tree", 0.31)], replaces=replaces)
     assert (len(plan.added), plan.replaced, plan.conflicts) == (1, [], [])
-    open_ = Annotation(2, Content(5.0, 0.0), "Ann", 0, 1)
+    open_ = Annotation(2, Content(5.0, 0.0), "Ann", "", 0, 1)
     twice = [Content(5.0, 0.0, "tree", 0.3), Content(5.0, 0.0, "tree", 0.5)]
     plan = import_plan([open_], twice, replaces=replaces)
     assert [content and content.dbh for *_, content in plan.filled] == [0.3]
@@ -669,7 +715,7 @@ def test_a_table_changes_only_what_its_rows_are_about(replaces: bool) -> None:
 def test_an_emptied_diameter_is_a_difference(
     replaces: bool, has_diameters: bool, left: list[float | None]
 ) -> None:
-    measured = Annotation(1, Content(0.0, 0.0, "tree", 0.31), "Ann", 0, 1)
+    measured = Annotation(1, Content(0.0, 0.0, "tree", 0.31), "Ann", "", 0, 1)
     emptied = [Content(0.0, 0.0, "tree", None)]
     plan = import_plan([measured], emptied, replaces=replaces, has_diameters=has_diameters)
     assert [content and content.dbh for *_, content in plan.replaced] == left

@@ -333,13 +333,15 @@ def test_what_an_undo_restores_is_of_who_made_it(tmp_path: Path):
         assert store.annotations(run) == []
 
 
-def test_annotations_of_the_version_before_are_kept(tmp_path: Path):
+@pytest.mark.parametrize(("version", "later"), [(8, ("reach", "dbh_who")), (9, ("dbh_who",))])
+def test_annotations_of_earlier_versions_are_kept(tmp_path: Path, version: int, later: tuple[str, ...]):
     with contextlib.closing(Store(tmp_path)) as store:
         run = store.open_run("d", "u", "n")
         store.add(run, ANN, [Content(1.0, 2.0, "pole")])
     path = tmp_path / FILE_NAME
-    spoil(path, "ALTER TABLE annotations DROP COLUMN reach")
-    spoil(path, "PRAGMA user_version = 8")
+    for column in later:
+        spoil(path, f"ALTER TABLE annotations DROP COLUMN {column}")
+    spoil(path, f"PRAGMA user_version = {version}")
     for _ in range(2):
         with contextlib.closing(Store(tmp_path)) as store:
             assert store.contents("d") == [Content(1.0, 2.0, "pole")]
