@@ -416,8 +416,8 @@ def _no_tree(verdict: Int32, up: str, ground_seen: float) -> list[str]:
 
 
 def _standing_twice(place: Float, dbh: Float) -> list[str]:
-    """Return a warning if several pairs of stems with alike diameters have one rigid motion: two passes of the
-    scanner that do not fit. In rows of a plantation a motion has another stem at its end.
+    """Return a warning if several pairs of stems with alike diameters have one rigid motion: two passes of
+    the scanner that do not fit. In rows of a plantation a motion has another stem at its end.
 
     Args:
         place: Positions of the trees, shape (T, 2) [m].
@@ -443,8 +443,8 @@ def _standing_twice(place: Float, dbh: Float) -> list[str]:
         if chance * len(tried) <= BY_CHANCE:
             apart = np.hypot(*shift[most].T)
             return [
-                f"{TWICE}: {len(most)} pairs are {apart.min():.2f} to {apart.max():.2f} m apart by one motion, "
-                "so two passes of the scanner do not fit; register the scans again"
+                f"{TWICE}: {len(most)} pairs are {apart.min():.2f} to {apart.max():.2f} m apart by one motion,"
+                " so two passes of the scanner do not fit; register the scans again"
             ]
     return []
 

@@ -80,7 +80,7 @@ def test_stems_with_one_rotation_stand_twice(turn):
         place, dbh = rng.uniform(-12.0, 12.0, (30, 2)), rng.uniform(0.1, 0.4, 30)
         again = place @ rotation.T + [0.15, 0.1] + rng.normal(0.0, 0.006, place.shape)
         apart = np.hypot(*(again - place).T) > 0.15  # nearer ones are one stem
-        both = np.vstack([place, again[apart]]) + [500.0, 200.0]
+        both = np.array([500.0, 200.0]) + np.vstack([place, again[apart]])
         told += bool(_standing_twice(both, np.append(dbh, dbh[apart])))
     assert told >= 18
 
