@@ -443,8 +443,8 @@ def _standing_twice(place: Float, dbh: Float) -> list[str]:
         if chance * len(tried) <= BY_CHANCE:
             apart = np.hypot(*shift[most].T)
             return [
-                f"{TWICE}: {len(most)} pairs are {apart.min():.2f} to {apart.max():.2f} m apart by one motion,"
-                " so two passes of the scanner do not fit; register the scans again"
+                f"{TWICE}: {len(most)} pairs are {apart.min():.2f} to {apart.max():.2f} m apart by one "
+                "motion, so two passes of the scanner do not fit; register the scans again"
             ]
     return []
 
