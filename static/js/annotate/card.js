@@ -29,8 +29,7 @@ export const card = (answers, hint) => el("article", { id: "review", class: "rev
   el("div", { class: "review-side" },
     el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" }),
       button("review-story", "Story", "Why the mapping decided so, with the figures behind it", () => openTab("story"), "quiet small")),
-    answers,
-    dbhField()),
+    answers),
   hint);
 
 const dbhField = () =>
@@ -38,6 +37,7 @@ const dbhField = () =>
 
 // What else is known of the tree.
 export const moreEvidence = () => el("section", { id: "review-more", class: "review-more", "aria-label": "Further evidence on the tree" },
+  dbhField(),
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
@@ -233,7 +233,13 @@ export function fillCard() {
   showReady();
 }
 
+// The DBH is beside the picture where that is high enough, else below the answers.
+const hasRoom = matchMedia("(min-width: 701px) and (min-height: 840px)");
+const placeDbh = () => (hasRoom.matches ? document.querySelector(".review-side").append(byId("review-tape")) : byId("review-more").prepend(byId("review-tape")));
+
 export function startCard() {
+  hasRoom.addEventListener("change", placeDbh);
+  placeDbh();
   on("map", throttled(refresh, EVERY));
   on("tab selection", select);
   on("others", () => { if (annotating() && selectedTree()) loadAhead(); });
