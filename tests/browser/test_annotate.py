@@ -842,12 +842,12 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     field.fill("2.6")
     field.press("Enter")
     field.press("Enter")
-    expect(last.locator("span")).to_have_text(f"Tree {first['number']}: tree, 2.6 cm")
+    expect(last.locator("span")).to_have_text(f"Tree {first['number']}: tree, 2.6 cm (map {mapped})")
     page.evaluate(select, second["number"])
     person.answer("d")
     field.fill(str(second["dbh_cm"]))
     field.press("Enter")
-    expect(last.locator("span")).to_have_text(f"Tree {second['number']}: tree, {second['dbh_cm']:g} cm")
+    expect(last.locator("span")).to_contain_text(f"Tree {second['number']}: tree, {second['dbh_cm']:g} cm")
 
     # The keys of the card act again after Escape.
     page.evaluate(select, first["number"])
@@ -880,7 +880,7 @@ def test_the_line_with_undo_belongs_to_the_last_edit_and_undo_says_what_it_did(p
     expect(last).to_contain_text(f"Tree {tree['number']}: tree")
     page.evaluate("import('/static/js/annotate/annotations.js').then(it => it.addAt({ x: 4, y: 30 }))")
     person.until_server("/api/annotations", "it.trees.length === 2")
-    expect(last).to_be_hidden()
+    expect(last).to_contain_text("Added: tree at 4.000, 30.000")
     canvas.press("ArrowRight")
     person.until_server("/api/annotations", "Math.abs(it.trees[1].x - 4.01) < 1e-6")
     row = page.locator("#annotations tbody tr").first

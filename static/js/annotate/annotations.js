@@ -537,7 +537,7 @@ export function answerText() {
   if (!draft.answer) return "";
   const { number, kind, dbh, isStored } = draft.answer;
   if (number === null) return `Added: ${statement(kind, dbh)} at ${placeTexts([draft.answer.place.x, draft.answer.place.y]).join(", ")}`;
-  const mapped = dbh === null ? null : treeOf(number)?.dbh_cm ?? null;
+  const mapped = kind === "tree" && dbh !== null ? treeOf(number)?.dbh_cm ?? null : null;
   return `Tree ${number}: ${statement(kind, dbh)}${mapped === null ? "" : ` (map ${dbhFigure(mapped, treeOf(number).sigma_dbh_cm)})`}${isStored ? ", as before" : ""}${replacedText(draft.answer)}`;
 }
 
