@@ -411,7 +411,8 @@ def is_doubtful_dbh(dbh: float, mapped: float, sigma: float, usual: tuple[float,
     or lies outside `usual` where the map has none [m]. Such a diameter is often in another unit."""
     if not math.isfinite(mapped):
         return not usual[0] <= dbh <= usual[1]
-    return abs(dbh - mapped) > _MOST_SIGMAS * math.hypot(sigma, TAPE_SIGMA)
+    known = sigma if math.isfinite(sigma) else 0.0
+    return abs(dbh - mapped) > _MOST_SIGMAS * math.hypot(known, TAPE_SIGMA)
 
 
 @dataclass(frozen=True, slots=True)
@@ -423,7 +424,7 @@ class ImportPlan:
         filled, replaced: Id, version and new content of each annotation that gets a DBH, and of each one
             whose class or DBH is replaced.
         conflicts: The annotation and the row that contradicts it, of each row that is left out for that.
-            Other contents have their authors, empty if the row names none or those of the annotation.
+            Other contents have their authors.
         repeated: Number of rows that say nothing new.
         beside: Distance between row and annotation [m], of each row that is about an annotation but not at
             its place.
@@ -441,6 +442,7 @@ def import_plan(
     rows: Sequence[Annotation],
     contents: Sequence[Content],
     *,
+    name: str = "import",
     replaces: bool = False,
     has_diameters: bool = False,
 ) -> ImportPlan:
@@ -453,7 +455,9 @@ def import_plan(
 
     Args:
         rows: The annotations of objects.
-        contents: The rows of the table in the frame of the map, with their authors.
+        contents: The rows of the table in the frame of the map, with the authors that it names.
+        name: Author of what the table names no author of, or changes of an annotation whose author it names:
+            a table that was saved here names those of the annotations before it was corrected.
         replaces: Whether a row replaces the class and the DBH of its annotation, as after a correction of an
             exported table elsewhere.
         has_diameters: Whether the table has a column of diameters: then a row without DBH that replaces
@@ -475,18 +479,21 @@ def import_plan(
         here = known[j]
         dbh = content.dbh if content.dbh is not None or (replaces and has_diameters) else here.dbh
         is_other_dbh = here.dbh is not None and (dbh is None or abs(here.dbh - dbh) > _SAME_DBH)
-        if j < len(rows):  # a table that was saved here names the authors of what it changes
-            who = "" if content.who == rows[j].who else content.who
-            dbh_who = "" if content.dbh_who == rows[j].dbh_who else content.dbh_who
-            content = replace(content, who=who, dbh_who=dbh_who)
-        if here.kind != content.kind or is_other_dbh:
-            if replaces and j < len(rows) and j not in replaced | filled:
-                known[j] = replace(here, kind=content.kind, dbh=dbh, who=content.who, dbh_who=content.dbh_who)
+        before = {rows[j].who, rows[j].dbh_who} if j < len(rows) else set[str]()
+        who, dbh_who = (
+            name if not author or author in before else author
+            for author in (content.who, content.dbh_who or content.who)
+        )
+        if j == k:
+            known[j] = replace(here, who=who, dbh_who=dbh_who)
+        elif here.kind != content.kind or is_other_dbh:
+            if replaces and j < len(rows) and j not in replaced and j not in filled:
+                known[j] = replace(here, kind=content.kind, dbh=dbh, who=who, dbh_who=dbh_who)
                 replaced.add(j)
             else:
                 conflicts.append((here, content))
         elif here.dbh is None and dbh is not None:
-            known[j] = replace(here, dbh=dbh, who=content.who, dbh_who=content.dbh_who)
+            known[j] = replace(here, dbh=dbh, who=here.who or who, dbh_who=dbh_who)
             filled.add(j)
     added = [known[j] for j in range(len(rows), len(known)) if object_of[j] == j]
     edits: list[list[tuple[int, int, Content | None]]] = [
@@ -550,7 +557,7 @@ def carried_by(
         rows: The annotations of objects and skipped trees.
         repairs: The repairs, in their order; those of loops change nothing here.
     """
-    contents: dict[int, Content | None] = {row.id: row.content for row in rows}
+    contents = _authored(rows)
     tree_of = _trees_of(trees, rows)
     for repair in (repair for repair in repairs if not repair.is_of_loop):
         numbers, before = numbers_of(trees, repair), _places(trees)
@@ -582,7 +589,7 @@ def carried_along(
         before, after, pair: As in `_successors`.
         rows: The annotations of objects and skipped trees.
     """
-    contents: dict[int, Content | None] = {row.id: row.content for row in rows}
+    contents = _authored(rows)
     tree_of = _trees_of(before, rows)
     old, new = _places(before), _places(after)
     stays = _successors(before, after, pair)
@@ -625,6 +632,11 @@ def _successors(before: Trees, after: Trees, pair: Sequence[int]) -> dict[int, i
     return same
 
 
+def _authored(rows: Sequence[Annotation]) -> dict[int, Content | None]:
+    """Return by id the contents of annotations with their authors, which a repair does not change."""
+    return {row.id: replace(row.content, who=row.who, dbh_who=row.dbh_who) for row in rows}
+
+
 def _places(trees: Trees) -> dict[int, Float]:
     """Return the position of each tree by its number [m]."""
     return dict(zip(trees.number.tolist(), trees.position, strict=True))
@@ -655,7 +667,7 @@ def _merged_contents(
         return {}
     (kept, content), (left, other) = sorted(counting, key=lambda row: row[1].kind == SKIPPED)
     if content.dbh is None and content.kind == other.kind:
-        content = replace(content, dbh=other.dbh)
+        content = replace(content, dbh=other.dbh, dbh_who=other.dbh_who)
     return {kept: content, left: None}
 
 
@@ -682,6 +694,8 @@ def carried_back(repair: Repair, changes: Sequence[Changed]) -> list[tuple[int, 
                 x=now.x + before.x - after.x,
                 y=now.y + before.y - after.y,
                 dbh=before.dbh if now.dbh == after.dbh else now.dbh,
+                who=row.who,
+                dbh_who=before.dbh_who if now.dbh == after.dbh else row.dbh_who,
             )
         back.append((row.id, row.version, content))
     return back
@@ -690,22 +704,19 @@ def carried_back(repair: Repair, changes: Sequence[Changed]) -> list[tuple[int, 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
     """Return the author of the newest edit ("" if annotations were only deleted) and the number of
     annotations that were added, changed or deleted between two states, by id and version."""
-    old = {row.id: row for row in before}
-    edited = [row for row in after if row.id not in old or old[row.id].version != row.version]
+    old = {row.id: row.version for row in before}
+    edited = [row for row in after if old.get(row.id) != row.version]
     deleted = len(old.keys() - {row.id for row in after})
     if not edited:
         return "", deleted
-    newest = max(edited, key=lambda row: row.at_ns)
-    was = old.get(newest.id)
-    is_dbh_only = was is not None and replace(newest.content, dbh=was.content.dbh) == was.content
-    return (newest.dbh_who if is_dbh_only else "") or newest.who, len(edited) + deleted
+    return max(edited, key=lambda row: row.at_ns).by, len(edited) + deleted
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:
     """Return an annotation of an object as a dict of JSON values for the dashboard: `id`, `x` and `y` in the
     map [m], `kind`, `dbh_cm` (None if unknown), `reach_m` (see `reach_of`), the authors `who` and
-    `dbh_who` ("" without a DBH), `at_s` (time of the last edit [s since 1970], to the millisecond) and
-    `version`."""
+    `dbh_who` ("" without a DBH) and that of the last edit (`by`), its time `at_s` [s since 1970], to the
+    millisecond, and `version`."""
     content = row.content
     return {
         "id": row.id,
@@ -716,6 +727,7 @@ def row_payload(row: Annotation) -> dict[str, Any]:
         "reach_m": round(reach_of(content), 4),
         "who": row.who,
         "dbh_who": row.dbh_who,
+        "by": row.by,
         "at_s": round(row.at_ns / 1e9, 3),
         "version": row.version,
     }

@@ -106,7 +106,7 @@ class Annotation:
         content: Position, class and DBH.
         who: Author of the last edit that did more than to change the DBH.
         dbh_who: Author of the DBH; empty without one.
-        at_ns: Time of the last edit.
+        by, at_ns: Author and time of the last edit.
         version: Number of edits.
     """
 
@@ -114,6 +114,7 @@ class Annotation:
     content: Content
     who: str
     dbh_who: str
+    by: str
     at_ns: int
     version: int
 

@@ -134,8 +134,8 @@ _LONGEST_KEY = 600
 
 
 MOST_LISTED = 500
-# The page shows places and diameters with 0.1 mm, and returns them so.
-_ROUNDED_M = 0.0001
+# The page returns places and diameters rounded to 0.1 mm, which moves them by up to half of it.
+_ROUNDED_M = 0.00006
 # Time during which a deletion can be undone.
 _KEPT_NS = 30 * 86_400 * 1_000_000_000
 # Changes of the same parameters by one person within this time count as one change (a slider drag).
@@ -436,10 +436,15 @@ class Store:
     def annotations(self, run: int) -> list[Annotation]:
         """Return the annotations of the source with this number that are not deleted, in the order of their
         creation; [] for an unknown number."""
-        query = select(_annotations).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
+        query = (
+            select(_annotations, _steps.c.who.label("by"))
+            .outerjoin(_changes, _changes.c.id == _annotations.c.made_by)
+            .outerjoin(_steps, _steps.c.id == _changes.c.step)
+            .where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
+        )
         with self._engine.begin() as connection:
             rows = connection.execute(query.order_by(_annotations.c.id)).all()
-        return [_annotation(row) for row in rows]
+        return [_annotation(row, row.by) for row in rows]
 
     def contents(self, source: str, kind: str = "") -> list[Content]:
         """Return the contents of the annotations of a source that are not deleted, in the order of their
@@ -612,7 +617,9 @@ class Store:
                 if change.before is None or deleted_since or row.deleted != (change.after is None):
                     continue
                 after = None if change.after is None else _as_content(change.after)
-                found.append((_annotation(row), _as_content(change.before), after))
+                found.append(
+                    (_annotation(row, _author_of(connection, row.made_by)), _as_content(change.before), after)
+                )
         return found
 
     def undo(self, run: int, author: Author, subjects: Sequence[str] = ()) -> None:
@@ -901,10 +908,11 @@ def _columns(content: Content, who: str, dbh_who: str | None) -> dict[str, Any]:
     }
 
 
-def _annotation(row: Row[Any]) -> Annotation:
-    """Return the annotation of a row; in older tables the author is also that of the DBH."""
+def _annotation(row: Row[Any], by: str | None) -> Annotation:
+    """Return the annotation of a row, whose last edit was made by `by`; in older tables the author of the
+    annotation is also that of the edit and of the DBH."""
     dbh_who = "" if row.dbh is None else row.dbh_who or row.who
-    return Annotation(row.id, _content(row), row.who, dbh_who, row.at_ns, row.version)
+    return Annotation(row.id, _content(row), row.who, dbh_who, by or row.who, row.at_ns, row.version)
 
 
 def _content(row: Row[Any]) -> Content:
@@ -913,9 +921,9 @@ def _content(row: Row[Any]) -> Content:
 
 
 def _as_content(columns: dict[str, Any]) -> Content:
-    """Return the content whose `_columns` these are."""
-    place = columns["x"], columns["y"]
-    return Content(*place, columns["kind"], columns["dbh"], columns["plot"], columns.get("reach"))
+    """Return the content whose `_columns` these are, with its authors."""
+    place, authors = (columns["x"], columns["y"]), (columns.get("who") or "", columns.get("dbh_who") or "")
+    return Content(*place, columns["kind"], columns["dbh"], columns["plot"], columns.get("reach"), *authors)
 
 
 def _key(source: str) -> str:

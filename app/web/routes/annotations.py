@@ -190,8 +190,9 @@ async def redo(body: _Turn, dashboard: Dash) -> Response:
 @router.post("/annotations/import")
 async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     """Add the rows of a CSV table, and the diameters that annotations lack, in one edit, see `import_plan`.
-    The author of each is that of the row in a column `who`, and of its diameter that in a column `dbh_who`,
-    else the import ("import of plot.csv"), also where an annotation of the author of the row changes.
+    The author of each is that of the row in a column `who`, and of its diameter that in a column `dbh_who`
+    or, without it, `who`; else the import ("import of plot.csv"), also where the row names an author of the
+    annotation that it changes.
 
     Return the number of added annotations (`added`), of diameters added to others (`filled`), of annotations
     whose class or diameter is replaced (`replaced`), of rows that exist already as annotations or earlier in
@@ -206,11 +207,11 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     contents, has_diameters = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
     if dashboard.shown is not None:
         await asyncio.to_thread(_check_unit, dashboard.shown.frame.trees, contents)
-    plan = import_plan(
-        dashboard.annotation_editor.rows, contents, replaces=body.replaces, has_diameters=has_diameters
-    )
+    rows = dashboard.annotation_editor.rows
+    choices = {"replaces": body.replaces, "has_diameters": has_diameters}
+    plan = await asyncio.to_thread(import_plan, rows, contents, name=body.author.who, **choices)
     changed = [*plan.filled, *plan.replaced]
-    before = {row.id: row.content for row in dashboard.annotation_editor.rows}
+    before = {row.id: row.content for row in rows}
     name_of = _namer(dashboard)
     replacements = [
         _replacement(name_of(before[number]), before[number], content)
@@ -259,7 +260,7 @@ async def export_table(dashboard: Dash) -> Response:
 @router.get("/annotations.geojson")
 async def export_geojson(dashboard: Dash) -> Response:
     """Return the annotations as a FeatureCollection of points in the frame of the map, or of the file of a
-    run of one step, which it declares, with class, DBH [cm], author, time and number of the tree in
+    run of one step, which it declares, with class, DBH [cm], authors, time and number of the tree in
     the map of the shown scan; no features without annotations."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
@@ -380,27 +381,29 @@ def _replacement(name: str, before: Content, after: Content) -> str:
 
 
 def _doubts(dashboard: Dashboard, contents: Sequence[Content]) -> list[str]:
-    """Return a text for each annotation of a tree of the shown map with a doubtful DBH, see
-    `is_doubtful_dbh`."""
+    """Return a text for each annotation with a doubtful DBH, see `is_doubtful_dbh`."""
     if dashboard.shown is None:
         return []
-    trees, doubts = dashboard.shown.frame.trees, list[str]()
+    trees, doubts, (x, y) = dashboard.shown.frame.trees, list[str](), dashboard.offset
     rows = np.flatnonzero(trees.confirmed)
     usual = usual_dbh(trees.dbh[rows])
-    for k, of in annotation_of_tree(trees.position[rows], contents).items():
-        row, dbh = rows[k], contents[of].dbh
-        mapped, sigma = float(trees.dbh[row]), float(trees.dbh_sigma[row])
-        if dbh is not None and is_doubtful_dbh(dbh, mapped, sigma, usual):
-            here = f"{_dbh_text(mapped)} in the map"
-            if not math.isfinite(mapped):
-                here = f"none in the map; usual are {_range_text(usual)}"
-            doubts.append(f"tree {trees.number[row]} has {_dbh_text(dbh)}, {here}")
+    tree_of = {of: rows[k] for k, of in annotation_of_tree(trees.position[rows], contents).items()}
+    for k, content in enumerate(contents):
+        row, name = tree_of.get(k), f"the tree at {content.x + x:.2f}, {content.y + y:.2f}"
+        mapped, sigma = math.nan, math.nan
+        if row is not None:
+            mapped, sigma = float(trees.dbh[row]), float(trees.dbh_sigma[row])
+            name = f"tree {trees.number[row]}"
+        if content.dbh is not None and is_doubtful_dbh(content.dbh, mapped, sigma, usual):
+            known = f"{_dbh_text(mapped)} in the map"
+            here = known if math.isfinite(mapped) else f"none in the map; usual are {_range_text(usual)}"
+            doubts.append(f"{name} has {_dbh_text(content.dbh)}, {here}")
     return doubts
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
     """Return an annotation, see `_rows`, as a GeoJSON feature (dict): a point at x, y with the `id` of the
-    annotation and the properties `class`, `dbh_cm`, `who`, `edited` (time as text) and `tree`."""
+    annotation and the properties `class`, `dbh_cm`, `who`, `dbh_who`, `edited` (time as text) and `tree`."""
     properties = {
         "class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"],
         "dbh_who": row["dbh_who"] or None, "edited": _when(row), "tree": row["tree"],
@@ -436,9 +439,9 @@ def _faults(content: Content) -> Iterator[SourceError]:
         yield SourceError(f"it is farther than {FARTHEST_M:,.0f} m from the origin")
     if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
         yield SourceError(f"the DBH is {content.dbh:.1f} m", remedy="Check the unit of the diameter")
-    for name in (content.who, content.dbh_who):
+    for column, name in (("who", content.who), ("dbh_who", content.dbh_who)):
         if name and not is_user_name(name):
-            yield SourceError(f"who = {name[:60]!r} is not a name")
+            yield SourceError(f"{column} = {name[:60]!r} is not a name")
 
 
 def _check_unit(trees: Trees, contents: list[Content]) -> None:

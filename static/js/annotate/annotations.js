@@ -3,7 +3,7 @@
 import { get, put, request } from "../core/api.js";
 import { placeTexts } from "../core/coordinates.js";
 import { byId, randomId, recall, remember } from "../core/dom.js";
-import { capital, count, dbhFigure, share } from "../core/format.js";
+import { capital, count, dbhFigure, figure, share } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { attempted, showNews } from "../core/problem.js";
@@ -124,8 +124,9 @@ function arrived(serial) {
 // The new annotation is chosen unless another tree was selected meanwhile.
 async function add(content) {
   const before = state.selected;
-  const given = { kind: "tree", dbh_cm: null, ...content };
+  const given = { kind: "tree", dbh_cm: null, ...content }, known = new Set(rows().map(({ id }) => id));
   const done = await edit(() => call("POST", "", given), { number: null, kind: given.kind, dbh: given.dbh_cm, before: null, place: given });
+  if (known.has(done?.id)) draft.answer = null; // another person had added it, so that nothing was stored
   if (done && state.selected === before) choose(done.id);
   return done;
 }
@@ -415,8 +416,8 @@ async function answer(tree, kind, fields = {}, goesOn = true) {
   answering.add(number);
   const stored = edit(async () => {
     const row = annotationOf(tree); // after the edits before this one
-    const isSeen = row && row.id === seen?.id && row.version === seen.version;
-    if (row && !isSeen && row.who !== myName()) throw new Error(`it was annotated by ${row.who} meanwhile; your answer was not stored.`);
+    const isSeen = row && row.id === seen?.id && row.version === latest(seen);
+    if (row && !isSeen && row.by !== myName()) throw new Error(`it was annotated by ${row.by} meanwhile; your answer was not stored.`);
     return row ? patched(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind, ...fields } : { kind, ...fields })
       : call("POST", "", { x: tree.x, y: tree.y, kind, dbh_cm: null, ...fields });
   }, given);
@@ -517,7 +518,7 @@ function tellReplaced() {
   const now = new Map(rows().filter((row) => draft.answered.includes(row.id)).map((row) => [row.id, row]));
   for (const [id, row] of now) {
     const was = answers.get(id), isOther = was && (was.kind !== row.kind || was.dbh_cm !== row.dbh_cm);
-    if (isOther && row.who !== myName()) showNews(`${capital(treeNumberOf(row) === null ? "your annotation" : `tree ${treeNumberOf(row)}`)}: ${statement(row.kind, row.dbh_cm)} by ${row.who}, in place of ${statement(was.kind, was.dbh_cm)}.`);
+    if (isOther && row.by !== myName()) showNews(`${capital(treeNumberOf(row) === null ? "your annotation" : `tree ${treeNumberOf(row)}`)}: ${statement(row.kind, row.dbh_cm)} by ${row.by}, in place of ${statement(was.kind, was.dbh_cm)}.`);
   }
   answers = now;
 }
@@ -538,7 +539,7 @@ export function answerText() {
   const { number, kind, dbh, isStored } = draft.answer;
   if (number === null) return `Added: ${statement(kind, dbh)} at ${placeTexts([draft.answer.place.x, draft.answer.place.y]).join(", ")}`;
   const mapped = kind === "tree" && dbh !== null ? treeOf(number)?.dbh_cm ?? null : null;
-  return `Tree ${number}: ${statement(kind, dbh)}${mapped === null ? "" : ` (map ${dbhFigure(mapped, treeOf(number).sigma_dbh_cm)})`}${isStored ? ", as before" : ""}${replacedText(draft.answer)}`;
+  return `Tree ${number}: ${statement(kind, dbh)}${mapped === null ? "" : ` (map ${dbhFigure(mapped, treeOf(number).sigma_dbh_cm)} cm)`}${isStored ? ", as before" : ""}${replacedText(draft.answer)}`;
 }
 
 // The answer that this one replaced, with the name of another person.
@@ -560,7 +561,7 @@ export function typedDoubt(tree, dbh) {
   const { least, most, isOfMap } = usualDbh();
   if (dbh >= least && dbh <= most) return "";
   const [word, limit] = dbh < least ? ["thinner", least] : ["thicker", most];
-  return `${isOfMap ? `No mapped stem is ${word} than ${figure(limit)}` : `Few stems are ${word} than ${limit}`} cm. Was it typed in cm?`;
+  return `${isOfMap ? `No mapped stem is ${word} than ${figure(limit)}` : `Few stems are ${word} than ${limit}`} cm. Is it right, in cm?`;
 }
 
 // The range of diameters [cm] that are not asked about where the map has none, see `usual_dbh` in app/dashboard/annotations.py.

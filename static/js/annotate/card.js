@@ -233,9 +233,13 @@ export function fillCard() {
   showReady();
 }
 
-// The DBH is beside the picture where that is high enough, else below the answers.
+// The DBH is beside the picture where that is high enough, else below the answers. It does not move while a person types.
 const hasRoom = matchMedia("(min-width: 701px) and (min-height: 840px)");
-const placeDbh = () => (hasRoom.matches ? document.querySelector(".review-side").append(byId("review-tape")) : byId("review-more").prepend(byId("review-tape")));
+function placeDbh() {
+  const field = byId("review-tape");
+  if (field.contains(document.activeElement)) return field.addEventListener("focusout", () => setTimeout(placeDbh), { once: true });
+  return hasRoom.matches ? document.querySelector(".review-side").append(field) : byId("review-more").prepend(field);
+}
 
 export function startCard() {
   hasRoom.addEventListener("change", placeDbh);

@@ -71,7 +71,7 @@ function build() {
         ...[["tree"], ["class"], ["DBH cm"], ["x ", unitNode()], ["y ", unitNode()], ["by"]].map((parts) => el("th", { scope: "col" }, ...parts)), el("td"))), el("tbody"))),
     el("div", { class: "annotate-files" },
       el("label", {}, "Name ", nameField("annotate-name")),
-      button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised. A row is listed under the name in a column who, as in saved tables, else as an import of the file", () => file.click()), unit,
+      button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised. A row is listed under the names in the columns who and dbh_who, as in saved tables, else as an import of the file", () => file.click()), unit,
       el("label", { title: "For a table that was saved here and corrected elsewhere: its class and DBH replace those of the annotation at the same place; an emptied DBH removes the one here. Otherwise rows that differ are left out and named" }, replaces, " replace what differs"), file,
       truthLink("csv", "CSV"), truthLink("geojson", "GeoJSON")),
     el("details", { id: "annotate-imported", class: "annotate-imported", hidden: true }),
@@ -106,15 +106,16 @@ async function take(file, unit, replaces) {
     draft.error = `${file.name} is larger than ${LARGEST_TABLE / 1e6} MB.`;
     return fill();
   }
+  byId("annotate-imported").hidden = true;
   const confirmed = () => trees().filter((tree) => reviewOf(tree) === "confirmed").length, before = confirmed();
   const done = await importTable(await file.text(), file.name, unit, replaces);
   const more = confirmed() - before;
   if (done) imported = `${count(done.added, "tree")} imported from ${file.name}${done.filled ? `; ${count(done.filled, "diameter")} added` : ""}${done.replaced ? `; ${count(done.replaced, "annotation")} replaced (${listed(done.replacements, done.replaced)})` : ""}${differingText(done)}${done.left_out ? `; ${done.left_out} left out because they were annotated already` : ""}${besideText(done)}${more > 0 ? `; ${count(more, "tree")} of the map ${more === 1 ? "is" : "are"} confirmed by them, as if answered with Yes` : ""}${done.doubtful ? `; check ${count(done.doubtful, "diameter")}: ${listed(done.doubts, done.doubtful)}` : ""}.`;
-  if (done) {
+  if (!done) showProblem(draft.error); // the button is below the list, the error above it
+  else {
     fillImported(done, file.name);
     showDone(imported);
   }
-  else showProblem(draft.error); // the button is below the list, the error above it
   fill();
 }
 
@@ -126,10 +127,11 @@ function listed(texts, number) {
 
 // All that the last import has replaced, left out or asks about.
 function fillImported({ replacements, replaced, differences, differing, doubts, doubtful }, name) {
-  const groups = [["Replaced", replacements, replaced], ["Left out, because it differs", differences, differing], ["Diameters to check", doubts, doubtful]].filter(([, texts]) => texts.length);
+  const groups = [["Replaced", replacements, replaced], ["Left out because they differ", differences, differing], ["Diameters to check", doubts, doubtful]].filter(([, texts]) => texts.length);
   const box = byId("annotate-imported");
   box.hidden = !groups.length;
-  box.replaceChildren(el("summary", { text: `Import of ${name}: ${groups.map(([title, , number]) => `${title.toLowerCase()} ${number}`).join("; ")}` }),
+  box.dataset.run = state.annotations?.run;
+  box.replaceChildren(el("summary", { text: `Import of ${name}: ${groups.map(([title, , number]) => `${title.toLowerCase()}: ${number}`).join("; ")}` }),
     ...groups.flatMap(([title, texts, number]) => [el("p", { text: `${title}:` }), el("ul", {}, ...texts.map((text) => el("li", { text })), number > texts.length ? el("li", { text: `and ${number - texts.length} more` }) : "")]));
 }
 
@@ -223,6 +225,7 @@ function fill() {
   setText(byId("review-last").firstChild, answerText());
   byId("review-back").hidden = Boolean(draft.answer?.isStored); // nothing to take back
   fillHistory();
+  if (byId("annotate-imported").dataset.run !== String(state.annotations?.run)) byId("annotate-imported").hidden = true; // its numbers are those of another map
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), contradictionText(":"));
@@ -248,7 +251,7 @@ function fillHistory() {
 // Buttons that choose annotations, the first ones of many, and how many more there are.
 function fillRows(box, annotations) {
   const shown = annotations.slice(0, MOST_LISTED), more = annotations.length - shown.length;
-  const now = JSON.stringify([more, shown.map((row) => [row.id, row.kind, treeNumberOf(row)]), draft.chosen]);
+  const now = JSON.stringify([more, shown.map((row) => [row.id, row.kind, authorsText(row), treeNumberOf(row)]), draft.chosen]);
   box.hidden = !shown.length;
   if (box.dataset.now === now) return; // the focus stays on a button
   box.dataset.now = now;

@@ -120,10 +120,11 @@ const line = (x, y, name) => ({ type: "scatter", mode: y.includes(null) ? "lines
 
 // A curve is not drawn over a silence, see `_note_silences` in app/dashboard/events.py; of a long run not each scan is drawn.
 function brokenAtSilences(curve) {
-  const steps = curve.x.slice(1).map((time, k) => time - curve.x[k]), usual = steps.toSorted((a, b) => a - b)[Math.floor(steps.length / 4)];
+  const steps = curve.x.slice(1).map((time, k) => time - curve.x[k]), usual = steps.toSorted((a, b) => a - b)[Math.floor((steps.length - 1) / 4)];
   const ends = steps.flatMap((step, k) => (step > Math.max(SILENT, 2 * usual) ? [k + 1] : [])), parts = [0, ...ends].map((from, k) => [from, ends[k]]);
   const joined = (values, between) => parts.flatMap(([from, to]) => [...(from ? [between(from)] : []), ...values.slice(from, to)]);
-  return { ...curve, x: joined(curve.x, (from) => curve.x[from - 1]), y: joined(curve.y, () => null) };
+  const isAlone = parts.some(([from, to = curve.x.length]) => to - from === 1); // a line does not show a single sample
+  return { ...curve, ...(isAlone && { mode: "lines+markers" }), x: joined(curve.x, (from) => curve.x[from - 1]), y: joined(curve.y, () => null) };
 }
 
 // --- choice of the quantities ------------------------------------------------------------------

@@ -469,6 +469,20 @@ async def test_class_and_dbh_have_the_authors_of_the_table_else_the_name_of_the_
     assert (await authors())[:4] == [("Ann", "import of mended.csv"), *filled[1:], *corrected]
 
 
+def test_an_import_keeps_the_authors_that_its_rows_do_not_replace() -> None:
+    twice = [Content(1.0, 1.0, who="Ann"), Content(1.0, 1.0, "tree", 0.3, who="Bob")]
+    (added,) = import_plan([], twice).added
+    assert (added.who, added.dbh_who) == ("Ann", "Bob")
+    known = Annotation(1, Content(1.0, 1.0, "tree", 0.3), "Ann", "Bob", "Bob", 0, 2)
+    for who, dbh_who, expected in (
+        ("Eve", "Bob", ("Eve", "import")), ("Bob", "", ("import", "import")), ("Eve", "", ("Eve", "Eve")),
+    ):  # fmt: skip
+        row = Content(1.0, 1.0, "pole", 0.4, who=who, dbh_who=dbh_who)
+        ((_, _, changed),) = import_plan([known], [row], replaces=True).replaced
+        assert changed is not None
+        assert (changed.who, changed.dbh_who) == expected
+
+
 async def test_the_dbh_keeps_its_author_where_another_person_changes_the_class(both: Running) -> None:
     client, _ = both
     number = (await edit(client, "POST", x=1.0, y=2.0)).json()["id"]
@@ -484,7 +498,7 @@ async def test_the_dbh_keeps_its_author_where_another_person_changes_the_class(b
     assert "changed by Eve" in late.text
     await edit(client, "PATCH", f"/{number}", version=3, **place, kind="pole", **BOB)
     [row] = await rows(client)
-    assert (row["who"], row["dbh_who"], row["dbh_cm"]) == ("Eve", "", None)
+    assert (row["who"], row["dbh_who"], row["by"], row["dbh_cm"]) == ("Eve", "", "Bob", None)
     late = await edit(client, "PATCH", f"/{number}", version=1, **place, dbh_cm=9.0)
     assert late.status_code == 409
     assert "changed by Bob" in late.text
@@ -672,7 +686,7 @@ async def test_a_store_with_a_full_queue_finishes_its_requests_and_closes(is_ope
 
 
 def test_who_asks_for_one_of_two_truths_is_not_told_the_other() -> None:
-    rows = [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", "", 0, 1)]
+    rows = [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", "", "Ann", 0, 1)]
     assert truth_of(None, rows, "own") is None
     assert truth_of(truth_trees(), [], "annotations") is None
     assert (counted(None, rows, "both"), counted(None, rows, "annotations")) == ("annotations",) * 2
@@ -690,8 +704,8 @@ def test_merged_trees_of_a_repaired_path_are_found_by_those_that_were_seen_with_
 
 def test_a_rejection_of_a_vanished_tree_neither_follows_nor_decides_a_merge() -> None:
     there = trees(np.array([[0.3, 0.0], [0.9, 0.0]]))
-    gone = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", "", 0, 1)
-    confirmed = Annotation(2, Content(0.9, 0.0, "tree", 0.31), "Ben", "Ben", 0, 1)
+    gone = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", "", "Ann", 0, 1)
+    confirmed = Annotation(2, Content(0.9, 0.0, "tree", 0.31), "Ben", "Ben", "Ben", 0, 1)
     places = ((0.3, 0.0), (0.9, 0.0))
     changes = carried_by(there, [gone, confirmed], [Repair("merge", places)])
     assert [(id_, content is None) for id_, _, content in changes] == [(2, False)]
@@ -699,10 +713,10 @@ def test_a_rejection_of_a_vanished_tree_neither_follows_nor_decides_a_merge() ->
 
 @pytest.mark.parametrize("replaces", [False, True])
 def test_a_table_changes_only_what_its_rows_are_about(replaces: bool) -> None:
-    rejected = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", "", 0, 1)
+    rejected = Annotation(1, Content(0.0, 0.0, "pole", reach=0.15), "Ann", "", "Ann", 0, 1)
     plan = import_plan([rejected], [Content(0.3, 0.0, "tree", 0.31)], replaces=replaces)
     assert (len(plan.added), plan.replaced, plan.conflicts) == (1, [], [])
-    open_ = Annotation(2, Content(5.0, 0.0), "Ann", "", 0, 1)
+    open_ = Annotation(2, Content(5.0, 0.0), "Ann", "", "Ann", 0, 1)
     twice = [Content(5.0, 0.0, "tree", 0.3), Content(5.0, 0.0, "tree", 0.5)]
     plan = import_plan([open_], twice, replaces=replaces)
     assert [content and content.dbh for *_, content in plan.filled] == [0.3]
@@ -715,7 +729,7 @@ def test_a_table_changes_only_what_its_rows_are_about(replaces: bool) -> None:
 def test_an_emptied_diameter_is_a_difference(
     replaces: bool, has_diameters: bool, left: list[float | None]
 ) -> None:
-    measured = Annotation(1, Content(0.0, 0.0, "tree", 0.31), "Ann", "", 0, 1)
+    measured = Annotation(1, Content(0.0, 0.0, "tree", 0.31), "Ann", "", "Ann", 0, 1)
     emptied = [Content(0.0, 0.0, "tree", None)]
     plan = import_plan([measured], emptied, replaces=replaces, has_diameters=has_diameters)
     assert [content and content.dbh for *_, content in plan.replaced] == left

@@ -119,22 +119,23 @@ async def test_merged_trees_keep_one_annotation_which_is_removed_with_the_merge(
         client.headers.update(BEARER)
         await show(dashboard)
         a, b = dashboard.shown.frame.trees.position[:2].tolist()  # type: ignore[union-attr]
-        for at, kind, dbh in ((a, "tree", None), (b, "tree", 30.0)):
-            await edit(client, "POST", x=at[0], y=at[1], kind=kind, dbh_cm=dbh)
-        before = [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)]
+        for at, who, dbh in ((a, "Bob", None), (b, "Eve", 30.0)):
+            await edit(client, "POST", x=at[0], y=at[1], kind="tree", dbh_cm=dbh, who=who)
+        facts = ("x", "y", "dbh_cm", "who", "dbh_who")
+        before = [[row[each] for each in facts] for row in await trees_of(client)]
         shown = dashboard.shown
         merge = Repair("merge", places=(tuple(a), tuple(b)))
         merged, _ = repaired_trees(shown.frame.trees, merge)  # type: ignore[union-attr]
         assert (await repair(client, kind="merge", places=[a, b])).status_code == 201
         (row,) = await trees_of(client)
         assert (row["x"], row["y"]) == pytest.approx(tuple(merged.position[0]), abs=1e-3)
-        assert row["dbh_cm"] == 30.0
+        assert [row[each] for each in facts[2:]] == [30.0, "Bob", "Eve"]
         for way in ("undo", "redo", "undo", "redo"):
             await edit(client, "POST", f"/{way}")
         (of_merge,) = (await client.get("/api/annotations")).json()["others"]["repair"]
         version = of_merge["version"]
         assert (await edit(client, "DELETE", f"/{of_merge['id']}", version=version)).status_code == 200
-        assert [(row["x"], row["y"], row["dbh_cm"]) for row in await trees_of(client)] == before
+        assert [[row[each] for each in facts] for row in await trees_of(client)] == before
         await edit(client, "POST", "/undo")
         assert len(await trees_of(client)) == 1
 

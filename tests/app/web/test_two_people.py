@@ -119,7 +119,7 @@ async def test_of_two_edits_of_a_tree_at_once_one_is_taken_and_the_other_is_told
             winner = next(cm for cm, answer in zip(offers, answers, strict=True) if answer.status_code == 200)
             loser = next(cm for cm in offers if cm != winner)
             now = await row(client)
-            assert (now["dbh_cm"], now["who"]) == (winner, offers[winner]["who"])
+            assert (now["dbh_cm"], now["dbh_who"]) == (winner, offers[winner]["who"])
             # The second person looks again, and edits what is there now.
             again = await edit(
                 client, "PATCH", f"/{number}", offers[loser],

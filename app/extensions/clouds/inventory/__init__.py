@@ -6,7 +6,6 @@ stems, crowns. The points are read several times in parts, so that the memory do
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass
@@ -416,67 +415,42 @@ def _no_tree(verdict: Int32, up: str, ground_seen: float) -> list[str]:
 
 
 def _standing_twice(place: Float, dbh: Float) -> list[str]:
-    """Return a warning if several pairs of stems with alike diameters have one rigid motion: two passes of
-    the scanner that do not fit. In rows of a plantation a motion has another stem at its end.
+    """Return a warning if several pairs of stems have the same shift and alike diameters: two passes of the
+    scanner that do not fit. In rows of a plantation the shift has another stem at its end.
 
     Args:
         place: Positions of the trees, shape (T, 2) [m].
         dbh: Their diameters, NaN where unknown, shape (T,) [m].
     """
     from scipy.spatial import cKDTree
+    from scipy.special import bdtrc
 
     if not len(place):
         return []
     pairs = cKDTree(place).query_pairs(SHIFT_MAX, output_type="ndarray")
     unlike = np.abs(dbh[pairs[:, 0]] - dbh[pairs[:, 1]]) > SAME_DBH  # False where one is unknown
     pairs = pairs[~unlike]
-    if not len(pairs):
-        return []
-    # A small rotation about the middle moves a stem along its arm, which is turned by 90 degrees.
-    x, y = (place[pairs].mean(axis=1) - place.mean(axis=0)).T
-    arm, shift = np.column_stack([-y, x]), place[pairs[:, 1]] - place[pairs[:, 0]]
-    steps = np.arange(-math.ceil(SHIFT_MAX / SHIFT_SIGMA), math.ceil(SHIFT_MAX / SHIFT_SIGMA) + 1)
-    turns = steps * SHIFT_SIGMA / max(float(np.hypot(x, y).max()), SHIFT_MAX)
-    for tried in (np.zeros(1), turns):  # most passes are shifted only, which fewer pairs show
-        motions = [_common_motion(pairs, shift, arm, turn) for turn in tried.tolist()]
-        chance, most = min(motions, key=lambda motion: motion[0])
-        if chance * len(tried) <= BY_CHANCE:
-            apart = np.hypot(*shift[most].T)
-            return [
-                f"{TWICE}: {len(most)} pairs are {apart.min():.2f} to {apart.max():.2f} m apart by one "
-                "motion, so two passes of the scanner do not fit; register the scans again"
-            ]
-    return []
-
-
-def _common_motion(pairs: Int, shift: Float, arm: Float, turn: float) -> tuple[float, Int]:
-    """Return the probability that chance gives as many pairs of stems one motion with a rotation as have one,
-    and their rows.
-
-    Args:
-        pairs: Rows of the stems of each pair, shape (P, 2).
-        shift: Vectors between them, shape (P, 2) [m].
-        arm: Shift of each pair for a rotation by 1 rad, shape (P, 2) [m].
-        turn: The rotation [rad].
-    """
-    from scipy.spatial import cKDTree
-    from scipy.special import bdtrc
-
     n = len(pairs)
+    if not n:
+        return []
+    shift = place[pairs[:, 1]] - place[pairs[:, 0]]
     both = np.concatenate([shift, -shift])  # the stems of a pair have no order
-    rest = both - turn * np.concatenate([arm, arm])
-    rests = cKDTree(rest)
-    fullest = int(rests.query_ball_point(rest, SHIFT_SIGMA, return_length=True).argmax())
-    most = np.array(rests.query_ball_point(rest[fullest], SHIFT_SIGMA))
-    # Twin stems of a tree are all about as far apart, in directions that are random. The sum of unequal
-    # chances has no larger tail than that of their mean (Hoeffding 1956).
-    expected = np.hypot(*(rest[fullest] + turn * arm).T)
-    alike = np.abs(np.hypot(*shift.T) - expected) < SHIFT_SIGMA
-    share = np.minimum(2.0 * SHIFT_SIGMA / (np.pi * np.maximum(expected[alike], SHIFT_SIGMA)), 1.0).mean()
-    chance = n * bdtrc(len(most) - 2.0, max(np.count_nonzero(alike) - 1, 1), share)
+    shifts = cKDTree(both)
+    fullest = int(shifts.query_ball_point(shift, SHIFT_SIGMA, return_length=True).argmax())
+    most = np.array(shifts.query_ball_point(shift[fullest], SHIFT_SIGMA))
+    # Twin stems of a tree are all about as far apart, in directions that are random.
+    apart = np.hypot(*shift.T)
+    alike = int(np.count_nonzero(np.abs(apart - apart[fullest]) < SHIFT_SIGMA))
+    share = min(2.0 * SHIFT_SIGMA / (np.pi * max(float(apart[fullest]), SHIFT_SIGMA)), 1.0)
+    chance = n * bdtrc(len(most) - 2.0, max(alike - 1, 1), share)
     # In a row, the second stem of a pair is the first one of the next.
-    is_row = len(np.unique(pairs[most % n])) < 2 * len(most)
-    return (1.0 if is_row else float(chance)), most % n
+    if len(np.unique(pairs[most % n])) < 2 * len(most) or chance > BY_CHANCE:
+        return []
+    x, y = np.median(both[most], axis=0).tolist()
+    return [
+        f"{TWICE}: {len(most)} pairs are {x:.2f}, {y:.2f} m apart, so two passes of the scanner do not fit; "
+        "register the scans again"
+    ]
 
 
 def _sides(place: Float) -> tuple[float, float]:

@@ -72,30 +72,6 @@ def test_stems_with_one_shift_stand_twice(pairs, is_told):
     assert not _standing_twice(place, dbh)
 
 
-@pytest.mark.parametrize("turn", [0.01, -0.025])
-def test_stems_with_one_rotation_stand_twice(turn):
-    rng, told = np.random.default_rng(5), 0
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    for _ in range(20):
-        place, dbh = rng.uniform(-12.0, 12.0, (30, 2)), rng.uniform(0.1, 0.4, 30)
-        again = place @ rotation.T + [0.15, 0.1] + rng.normal(0.0, 0.006, place.shape)
-        apart = np.hypot(*(again - place).T) > 0.15  # nearer ones are one stem
-        both = np.array([500.0, 200.0]) + np.vstack([place, again[apart]])
-        told += bool(_standing_twice(both, np.append(dbh, dbh[apart])))
-    assert told >= 18
-
-
-def test_twin_stems_seldom_stand_twice():
-    rng, told = np.random.default_rng(6), 0
-    for _ in range(200):
-        place = rng.uniform(-12.0, 12.0, (40, 2))
-        angle, apart = rng.uniform(0.0, 2.0 * np.pi, 40), rng.uniform(0.25, 0.45, 40)
-        twins = place + apart[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-        dbh = rng.uniform(0.15, 0.2, 40)
-        told += bool(_standing_twice(np.vstack([place, twins]), np.append(dbh, dbh)))
-    assert told <= 2  # 200 times BY_CHANCE is 0.4 for each of the two searches
-
-
 def test_rows_and_dense_stems_stand_once():
     rng = np.random.default_rng(4)
     rows = np.stack(np.meshgrid(np.arange(0.0, 8.0, 0.8), np.arange(0.0, 8.0, 0.8)), axis=-1).reshape(-1, 2)
