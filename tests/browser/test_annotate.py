@@ -871,6 +871,27 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     person.until_server("/api/annotations", "it.trees.length === 0")
 
 
+# What is asked about diameters [cm] without one in the map, where the map has 9 or 8 diameters from 10.5 cm on.
+DOUBTS = """async () => {
+  const { state } = await import('/static/js/core/store.js');
+  const { typedDoubt } = await import('/static/js/annotate/annotations.js');
+  const { map } = state, [tree] = map.trees;
+  const said = [9, 8].map((number) => {
+    const trees = Array.from({ length: number }, (_, k) => ({ ...tree, number: 1000 + k, dbh_cm: 10.5 + k }));
+    state.map = { ...map, trees };
+    return [9.8, 15, 41].map((dbh) => typedDoubt({ dbh_cm: null }, dbh));
+  });
+  state.map = map;
+  return said;
+}"""
+
+
+def test_a_dbh_beyond_those_of_the_map_is_questioned_where_the_map_has_none(person: Dashboard):
+    doubts = person.page.evaluate(DOUBTS)
+    thin, thick = "No mapped stem is thinner than 10.5 cm", "No mapped stem is thicker than 18.5 cm"
+    assert doubts == [[f"{thin}. Is it right, in cm?", "", f"{thick}. Is it right, in cm?"], ["", "", ""]]
+
+
 def test_the_line_with_undo_belongs_to_the_last_edit_and_undo_says_what_it_did(person: Dashboard):
     page, canvas = person.page, person.page.locator("#map")
     last, news = page.locator("#review-last"), page.locator("#problem")
