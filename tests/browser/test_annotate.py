@@ -842,7 +842,7 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     field.fill("2.6")
     field.press("Enter")
     field.press("Enter")
-    expect(last.locator("span")).to_have_text(f"Tree {first['number']}: tree, 2.6 cm (map {mapped})")
+    expect(last.locator("span")).to_have_text(f"Tree {first['number']}: tree, 2.6 cm (map {mapped} cm)")
     page.evaluate(select, second["number"])
     person.answer("d")
     field.fill(str(second["dbh_cm"]))
@@ -877,7 +877,7 @@ DOUBTS = """async () => {
   const { typedDoubt } = await import('/static/js/annotate/annotations.js');
   const { map } = state, [tree] = map.trees;
   const said = [9, 8].map((number) => {
-    const trees = Array.from({ length: number }, (_, k) => ({ ...tree, number: 1000 + k, dbh_cm: 10.5 + k }));
+    const trees = Array.from({ length: number }, (_, k) => ({ ...tree, number: k + 1, dbh_cm: 10.5 + k }));
     state.map = { ...map, trees };
     return [9.8, 15, 41].map((dbh) => typedDoubt({ dbh_cm: null }, dbh));
   });
