@@ -871,7 +871,7 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     person.until_server("/api/annotations", "it.trees.length === 0")
 
 
-# What is asked about diameters [cm] without one in the map, where the map has 9 or 8 diameters from 10.5 cm on.
+# What is asked about diameters [cm] without one in the map, which has 9 or 8 diameters from 10.5 cm on.
 DOUBTS = """async () => {
   const { state } = await import('/static/js/core/store.js');
   const { typedDoubt } = await import('/static/js/annotate/annotations.js');
