@@ -451,7 +451,8 @@ def import_plan(
     A row nearer to an annotation than `reach_of` it is about the same object, and adds no second one; only
     the nearest row is about it, so that two stems of a table stay two. A row at the place of an earlier row
     is about the object of that row. A row gives its DBH to an annotation of the same class without DBH. With
-    another class or another DBH it is a conflict, and nothing is stored, unless it replaces an annotation.
+    another class or another DBH it is a conflict, and nothing is stored, unless it is the first row about an
+    annotation and replaces it.
 
     Args:
         rows: The annotations of objects.
@@ -470,6 +471,7 @@ def import_plan(
     same = _same_things(known, len(rows))
     object_of = {j: j for j in range(len(rows))} | {k: j for k, (j, _) in same.items()}
     filled, replaced, conflicts = set[int](), set[int](), list[tuple[Content, Content]]()
+    named = set[int]()  # of two rows about one annotation, the second one replaces nothing
     for k, content in enumerate(contents, start=len(rows)):
         if k not in same:
             near = at.query_ball_point((content.x, content.y), SAME_PLACE)
@@ -487,7 +489,7 @@ def import_plan(
         if j == k:
             known[j] = replace(here, who=who, dbh_who=dbh_who)
         elif here.kind != content.kind or is_other_dbh:
-            if replaces and j < len(rows) and j not in replaced and j not in filled:
+            if replaces and j < len(rows) and j not in named:
                 known[j] = replace(here, kind=content.kind, dbh=dbh, who=who, dbh_who=dbh_who)
                 replaced.add(j)
             else:
@@ -495,6 +497,7 @@ def import_plan(
         elif here.dbh is None and dbh is not None:
             known[j] = replace(here, dbh=dbh, who=here.who or who, dbh_who=dbh_who)
             filled.add(j)
+        named.add(j)
     added = [known[j] for j in range(len(rows), len(known)) if object_of[j] == j]
     edits: list[list[tuple[int, int, Content | None]]] = [
         [(row.id, row.version, known[j]) for j, row in enumerate(rows) if j in of]

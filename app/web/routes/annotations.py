@@ -196,11 +196,11 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
 
     Return the number of added annotations (`added`), of diameters added to others (`filled`), of annotations
     whose class or diameter is replaced (`replaced`), of rows that exist already as annotations or earlier in
-    the table (`left_out`), and of rows that are left out because they contradict an annotation (`differing`),
-    with the first _MOST_NAMED of these (`differences`), of what is replaced (`replacements`), and of the
-    doubtful diameters (`doubts`, in all `doubtful`) as text; of rows that are not exactly at the place of
-    their annotation (`beside`), with the smallest and the largest distance (`beside_m`); and the counts of
-    edits, see `edited`. 422 if the table cannot be read or has too many rows or rows with faults, of which
+    the table (`left_out`), and of rows that are left out because they contradict an annotation or another row
+    (`differing`), with the first _MOST_NAMED of each as text (`additions`, `fillings`, `replacements`,
+    `differences`) and of the doubtful diameters (`doubts`, in all `doubtful`); of rows that are not exactly
+    at the place of their annotation (`beside`), with the smallest and the largest distance (`beside_m`); and
+    the counts of edits, see `edited`. 422 if the table cannot be read or has too many rows or rows with faults, of which
     the first 10 are named, 409 as in `add`; then nothing is stored. Without anything new there is no edit."""
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
@@ -219,13 +219,21 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
         if content is not None
     ]
     differences = [_difference(name_of(here), here, there) for here, there in plan.conflicts[:_MOST_NAMED]]
+    fillings = [
+        f"{name_of(before[number])}: {_dbh_text(content.dbh)}"
+        for number, _, content in plan.filled[:_MOST_NAMED]
+        if content is not None
+    ]
     added = [replace(each, reach=_reach_at(dashboard, each.x, each.y)) for each in plan.added]
     if added or changed:
         await apply_edit(dashboard, body, Store.edit, added, changed)
     doubts = _doubts(dashboard, [*added, *(content for _, _, content in changed if content is not None)])
+    name_of = _namer(dashboard)
     payload = {
         "added": len(added),
+        "additions": [f"{name_of(each)}: {each.kind}" for each in added[:_MOST_NAMED]],
         "filled": len(plan.filled),
+        "fillings": fillings,
         "replaced": len(plan.replaced),
         "left_out": plan.repeated,
         "differing": len(plan.conflicts),

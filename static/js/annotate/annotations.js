@@ -433,7 +433,7 @@ async function answer(tree, kind, fields = {}, goesOn = true) {
 
 // Returns a typed DBH [cm], null for an empty text, or undefined and shows an error.
 export function typedDbh(typed) {
-  const text = typed.trim().replace(",", "."), value = text === "" ? null : Number(text);
+  const text = typed.trim().replace(/\s*cm$/i, "").replace(",", "."), value = text === "" ? null : Number(text);
   if (value === null || (value > 0 && value <= LARGEST_DBH)) return value;
   draft.error = `“${text.slice(0, 30)}” is not a DBH: enter centimetres above 0 and up to ${LARGEST_DBH}, or nothing if it was not measured.`;
   news();

@@ -125,9 +125,9 @@ function listed(texts, number) {
   return `${named.join("; ")}${number > named.length ? `; and ${number - named.length} more` : ""}`;
 }
 
-// All that the last import has replaced, left out or asks about.
-function fillImported({ replacements, replaced, differences, differing, doubts, doubtful }, name) {
-  const groups = [["Replaced", replacements, replaced], ["Left out because they differ", differences, differing], ["Diameters to check", doubts, doubtful]].filter(([, texts]) => texts.length);
+// All that the last import has changed, left out or asks about.
+function fillImported({ additions, added, fillings, filled, replacements, replaced, differences, differing, doubts, doubtful }, name) {
+  const groups = [["Diameters to check", doubts, doubtful], ["Left out because they differ", differences, differing], ["Replaced", replacements, replaced], ["Diameters added", fillings, filled], ["Added", additions, added]].filter(([, texts]) => texts.length);
   const box = byId("annotate-imported");
   box.hidden = !groups.length;
   box.dataset.run = state.annotations?.run;

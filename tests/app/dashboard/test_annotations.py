@@ -395,6 +395,18 @@ async def test_a_cell_that_states_nothing_neither_confirms_nor_removes(both: Run
     assert await rows(client) == before
 
 
+async def test_two_rows_about_one_annotation_do_not_replace_each_other(both: Running) -> None:
+    client, _ = both
+    await edit(client, "POST", x=1.0, y=2.0, dbh_cm=28.3)
+    table = "x_m,y_m,dbh_cm\n1,2,28.3\n1,2,26\n5,5,\n"
+    answer = (await edit(client, "POST", "/import", table=table, replaces=True)).json()
+    assert (answer["replaced"], answer["left_out"], answer["differing"]) == (0, 1, 1)
+    assert answer["differences"] == ["the annotation at 1.00, 2.00 has DBH 28.3 cm here, 26 cm in the file"]
+    assert answer["additions"] == ["the annotation at 5.00, 5.00: tree"]
+    answer = (await edit(client, "POST", "/import", table="x_m,y_m,dbh_cm\n5,5,31\n")).json()
+    assert answer["fillings"] == ["the annotation at 5.00, 5.00: 31 cm"]
+
+
 async def test_an_import_names_what_it_replaces_and_which_diameters_are_doubtful(both: Running) -> None:
     client, dashboard = both
     await show(dashboard)
