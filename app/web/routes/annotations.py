@@ -200,8 +200,9 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     (`differing`), with the first _MOST_NAMED of each as text (`additions`, `fillings`, `replacements`,
     `differences`) and of the doubtful diameters (`doubts`, in all `doubtful`); of rows that are not exactly
     at the place of their annotation (`beside`), with the smallest and the largest distance (`beside_m`); and
-    the counts of edits, see `edited`. 422 if the table cannot be read or has too many rows or rows with faults, of which
-    the first 10 are named, 409 as in `add`; then nothing is stored. Without anything new there is no edit."""
+    the counts of edits, see `edited`. 422 if the table cannot be read or has too many rows or rows with
+    faults, of which the first 10 are named, 409 as in `add`; then nothing is stored. Without anything new
+    there is no edit."""
     one_step = dashboard.status.one_step
     unit = (1.0, 1.0) if one_step is None else one_step.crs_unit
     contents, has_diameters = await asyncio.to_thread(_imported, body, dashboard.offset, unit)
