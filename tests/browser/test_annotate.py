@@ -1331,13 +1331,13 @@ def test_an_own_export_is_imported_with_diameters_and_its_contradictions_are_nam
 
 
 # A later map in which the tree of an annotation is gone, and another one is 0.3 m from its place.
-WITHOUT_OWN_TREE = """async ([number, reach]) => {
+WITHOUT_OWN_TREE = """async ([number, reach, kind]) => {
   const { state, changed } = await import('/static/js/core/store.js');
   const { reviewOf, withoutTree } = await import('/static/js/annotate/annotations.js');
   const { map, annotations } = state, [row] = annotations.trees;
   const beside = { ...map.trees.find((tree) => tree.number !== number), x: row.x + 0.3, y: row.y };
   state.map = { ...map, trees: [beside] };
-  state.annotations = { ...annotations, trees: [{ ...row, reach_m: reach }] };
+  state.annotations = { ...annotations, trees: [{ ...row, kind, reach_m: reach }] };
   changed('map');
   changed('annotations');
   const said = document.querySelector('#annotate-without');
@@ -1352,15 +1352,18 @@ def test_a_rejection_does_not_pass_to_a_neighbour_when_its_tree_is_gone(person: 
     )
     person.answer("Shift+P")
     person.until_server("/api/annotations", "it.trees.length === 1")
-    assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.5]) == ["rejected", 0, ""]
-    said = "1 answer belongs to no tree of this map, so it decides nothing:"
-    assert person.page.evaluate(WITHOUT_OWN_TREE, [tree["number"], 0.25]) == ["open", 1, said]
+    later, number = person.page.evaluate, tree["number"]
+    assert later(WITHOUT_OWN_TREE, [number, 0.5, "pole"]) == ["rejected", 0, ""]
+    said = "1 answer belongs to no tree of this map, so it"
+    assert later(WITHOUT_OWN_TREE, [number, 0.25, "pole"]) == ["open", 1, f"{said} decides nothing:"]
+    assert later(WITHOUT_OWN_TREE, [number, 0.25, "tree"]) == ["open", 0, f"{said} counts as an added tree:"]
 
 
 # 14 rejections of things that this map has not.
 MANY_WITHOUT_TREE = """async () => {
   const { state, changed } = await import('/static/js/core/store.js');
-  const same = { y: 900, kind: 'pole', dbh_cm: null, reach_m: 0.5, who: 'Ann', at_s: 0, version: 1 };
+  const authors = { who: 'Ann', dbh_who: '', by: 'Ann' };
+  const same = { ...authors, y: 900, kind: 'pole', dbh_cm: null, reach_m: 0.5, at_s: 0, version: 1 };
   const row = (id) => ({ ...same, id, x: id });
   state.annotations = { ...state.annotations, trees: Array.from({ length: 14 }, (_, k) => row(1e6 + k)) };
   changed('annotations');

@@ -270,6 +270,9 @@ export const treeNumberOf = (row) => paired().treeOf.get(row.id) ?? null;
 // Answers that a thing is no tree, whose thing is not in this map: they decide nothing.
 export const withoutTree = () => rows().filter((row) => row.kind !== "tree" && treeNumberOf(row) === null);
 
+// Trees that were confirmed in this window, and are not in this map: they count as added ones.
+export const confirmedWithoutTree = () => rows().filter((row) => row.kind === "tree" && draft.answered.includes(row.id) && treeNumberOf(row) === null);
+
 // The answer nearest to an open tree that was given for another thing; null without one.
 export const answerBeside = (tree) => nearest(withoutTree(), (row) => distance(row, tree), state.annotations.same_thing_m);
 

@@ -15,7 +15,7 @@ import { titleOf } from "../open/run_title.js";
 import { ofExtensions } from "../shell/extensions.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, annotationOf, answerBeside, answeredTrees, answerText, authorsText, byClick, byOther, callMe, change, choose, contradicting, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, typedDoubt, unreviewed, votesText, withoutTree } from "./annotations.js";
+import { annotating, annotationOf, answerBeside, answeredTrees, answerText, authorsText, byClick, byOther, callMe, change, choose, confirmedWithoutTree, contradicting, contradictionText, draft, givenName, importTable, isSkippable, KINDS, lookAt, NAME, nudge, previous, refuseHeld, refusePlain, rejectedKind, remove, review, reviewHistory, reviewOf, rowOf, rows, scoreAgainst, showCard, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, typedDoubt, unreviewed, votesText, withoutTree } from "./annotations.js";
 import { card, fillCard, moreEvidence, startCard, typeDbh } from "./card.js";
 import { startSection } from "./section.js";
 
@@ -230,11 +230,17 @@ function fill() {
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), contradictionText(":"));
   fillRows(byId("annotate-contradicting"), contradicting());
-  const without = withoutTree(), [said, list] = byId("annotate-without").children;
-  byId("annotate-without").hidden = !without.length;
-  setText(said, `${count(without.length, "answer")} ${without.length === 1 ? "belongs" : "belong"} to no tree of this map, so ${without.length === 1 ? "it decides" : "they decide"} nothing:`);
-  fillRows(list, without);
+  const rejected = withoutTree(), confirmed = confirmedWithoutTree(), [said, list] = byId("annotate-without").children;
+  byId("annotate-without").hidden = !rejected.length && !confirmed.length;
+  setText(said, `${lostText(rejected, "it decides nothing", "they decide nothing")}${rejected.length && confirmed.length ? "; " : ""}${lostText(confirmed, "it counts as an added tree", "they count as added trees")}:`);
+  fillRows(list, [...rejected, ...confirmed]);
   fillTable();
+}
+
+// What answers without a tree in this map do; "" without any.
+function lostText({ length }, one, more) {
+  if (!length) return "";
+  return length === 1 ? `1 answer belongs to no tree of this map, so ${one}` : `${length} answers belong to no tree of this map, so ${more}`;
 }
 
 // The last answers, the newest first, in the words of what is stored now; a click shows the tree again.
