@@ -840,7 +840,16 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     assert not rows(person)
     person.answer("d")
     field.fill("2.6")
-    field.press("Enter")
+    # Enter twice at once, and held down: nobody has read the question.
+    enter = "{ key: 'Enter', bubbles: true, cancelable: true, repeat }"
+    field.evaluate(
+        "node => [false, false, true].forEach(repeat =>"
+        f" node.dispatchEvent(new KeyboardEvent('keydown', {enter})))"
+    )
+    expect(page.locator("#review-dbh-error")).to_have_text(said)
+    expect(field).to_be_focused()
+    assert not rows(person)
+    page.wait_for_timeout(600)
     field.press("Enter")
     expect(last.locator("span")).to_have_text(f"Tree {first['number']}: tree, 2.6 cm (map {mapped} cm)")
     page.evaluate(select, second["number"])

@@ -15,6 +15,7 @@ import { annotating, annotationOf, askForTree, byOther, draft, following, isSkip
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
 const AHEAD = 2; // trees whose stories are loaded ahead
+const TO_READ = 500; // [ms] before which nobody has read a question: a glance at a word takes 200 to 250 ms, and a decision follows
 const KEPT = 4; // trees whose stories are loaded ahead or shown
 let shown = "", pictured = null; // version of the shown evidence; number of the tree of the camera picture
 const stories = new Map(); // of each subject the newest story: {index of the scan, promise}
@@ -119,11 +120,14 @@ function takeDbh({ target }) {
   }
 }
 
-// Returns whether a doubtful DBH is to be confirmed by a second Enter.
+// Returns whether a doubtful DBH is to be confirmed by a second Enter, which counts once the question can have been read.
+let askedAt = 0;
 function isQuestioned(input, tree) {
   const dbh = checkedDbh(input), doubt = tree && dbh !== undefined ? typedDoubt(tree, dbh) : "";
-  if (!doubt || input.dataset.asked === input.value || dbh === annotationOf(tree)?.dbh_cm) return false;
+  if (!doubt || dbh === annotationOf(tree)?.dbh_cm) return false;
+  if (input.dataset.asked === input.value) return performance.now() < askedAt + TO_READ;
   draft.error = "";
+  askedAt = performance.now();
   input.dataset.asked = input.value;
   input.setAttribute("aria-invalid", "true");
   setText(byId("review-dbh-error"), `${doubt} Press Enter again to store ${dbh} cm, Escape to restore it.`);
@@ -147,6 +151,7 @@ function endDbh(event) {
   if (key === "d" && event.repeat) event.preventDefault(); // the key that has opened the field is still held down
   if (key !== "Enter" && key !== "Escape") return;
   event.preventDefault();
+  if (event.repeat) return; // a key that is held down answers once
   draft.error = "";
   if (key === "Escape") showDbh(tree);
   else if (checkedDbh(target) === undefined || isQuestioned(target, tree)) return;
