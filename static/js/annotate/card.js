@@ -125,9 +125,10 @@ let askedAt = 0;
 function isQuestioned(input, tree) {
   const dbh = checkedDbh(input), doubt = tree && dbh !== undefined ? typedDoubt(tree, dbh) : "";
   if (!doubt || dbh === annotationOf(tree)?.dbh_cm) return false;
-  if (input.dataset.asked === input.value) return performance.now() < askedAt + TO_READ;
+  const isAsked = input.dataset.asked === input.value;
+  if (isAsked && performance.now() > askedAt + TO_READ) return false;
+  if (!isAsked) askedAt = performance.now();
   draft.error = "";
-  askedAt = performance.now();
   input.dataset.asked = input.value;
   input.setAttribute("aria-invalid", "true");
   setText(byId("review-dbh-error"), `${doubt} Press Enter again to store ${dbh} cm, Escape to restore it.`);
