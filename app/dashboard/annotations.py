@@ -368,8 +368,8 @@ class AnnotationEditor:
 
         The keys are `run`, `serial`, `problem` and `against`, the attributes; `used`, the result of
         `counted`; `own`, the number of objects in the ground truth of the source, None if there is none;
-        `contradicting`, the result of this function; `same_thing_m`, SAME_THING;
-        `doubt`, the limits of `is_doubtful_dbh` in cm; `trees` and `skipped`, lists of `row_payload`;
+        `contradicting`, the result of this function; `same_thing_m`, SAME_THING; `doubt`, the constants of
+        `is_doubtful_dbh` and `usual_dbh`, diameters in cm; `trees` and `skipped`, lists of `row_payload`;
         `others`, a dict from the class of each of `others` to a list of `values_payload`; `repairs`, the
         `identity_of` the repairs; and `frame`, the `values_payload` of `frame`, None for a local map.
         """
@@ -471,7 +471,7 @@ def import_plan(
     same = _same_things(known, len(rows))
     object_of = {j: j for j in range(len(rows))} | {k: j for k, (j, _) in same.items()}
     filled, replaced, conflicts = set[int](), set[int](), list[tuple[Content, Content]]()
-    named = set[int]()  # of two rows about one annotation, the second one replaces nothing
+    named = set[int]()  # objects of earlier rows: only the first row about an annotation replaces it
     for k, content in enumerate(contents, start=len(rows)):
         if k not in same:
             near = at.query_ball_point((content.x, content.y), SAME_PLACE)

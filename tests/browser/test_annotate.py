@@ -840,7 +840,7 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     assert not rows(person)
     person.answer("d")
     field.fill("2.6")
-    # Enter twice at once, and held down: nobody has read the question.
+    # A second Enter before the question can be read, and a held key, do not confirm the diameter.
     enter = "{ key: 'Enter', bubbles: true, cancelable: true, repeat }"
     field.evaluate(
         "node => [false, false, true].forEach(repeat =>"
@@ -880,7 +880,7 @@ def test_a_dbh_far_from_that_of_the_map_is_questioned_and_its_key_gives_the_keys
     person.until_server("/api/annotations", "it.trees.length === 0")
 
 
-# What is asked about diameters [cm] without one in the map, which has 9 or 8 diameters from 10.5 cm on.
+# The questions about three typed diameters [cm] of a tree without DBH, in maps with 9 and 8 diameters.
 DOUBTS = """async () => {
   const { state } = await import('/static/js/core/store.js');
   const { typedDoubt } = await import('/static/js/annotate/annotations.js');

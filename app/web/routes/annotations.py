@@ -228,8 +228,9 @@ async def import_table(body: _ImportTable, dashboard: Dash) -> Response:
     added = [replace(each, reach=_reach_at(dashboard, each.x, each.y)) for each in plan.added]
     if added or changed:
         await apply_edit(dashboard, body, Store.edit, added, changed)
-    doubts = _doubts(dashboard, [*added, *(content for _, _, content in changed if content is not None)])
     name_of = _namer(dashboard)
+    stored = [*added, *(content for _, _, content in changed if content is not None)]
+    doubts = _doubts(dashboard, stored, name_of)
     payload = {
         "added": len(added),
         "additions": [f"{name_of(each)}: {each.kind}" for each in added[:_MOST_NAMED]],
@@ -389,24 +390,24 @@ def _replacement(name: str, before: Content, after: Content) -> str:
     return f"{name}: {was} -> {now}"
 
 
-def _doubts(dashboard: Dashboard, contents: Sequence[Content]) -> list[str]:
+def _doubts(
+    dashboard: Dashboard, contents: Sequence[Content], name_of: Callable[[Content], str]
+) -> list[str]:
     """Return a text for each annotation with a doubtful DBH, see `is_doubtful_dbh`."""
     if dashboard.shown is None:
         return []
-    trees, doubts, (x, y) = dashboard.shown.frame.trees, list[str](), dashboard.offset
+    trees, doubts = dashboard.shown.frame.trees, list[str]()
     rows = np.flatnonzero(trees.confirmed)
     usual = usual_dbh(trees.dbh[rows])
     tree_of = {of: rows[k] for k, of in annotation_of_tree(trees.position[rows], contents).items()}
     for k, content in enumerate(contents):
-        row, name = tree_of.get(k), f"the tree at {content.x + x:.2f}, {content.y + y:.2f}"
         mapped, sigma = math.nan, math.nan
-        if row is not None:
+        if (row := tree_of.get(k)) is not None:
             mapped, sigma = float(trees.dbh[row]), float(trees.dbh_sigma[row])
-            name = f"tree {trees.number[row]}"
         if content.dbh is not None and is_doubtful_dbh(content.dbh, mapped, sigma, usual):
             known = f"{_dbh_text(mapped)} in the map"
             here = known if math.isfinite(mapped) else f"none in the map; usual are {_range_text(usual)}"
-            doubts.append(f"{name} has {_dbh_text(content.dbh)}, {here}")
+            doubts.append(f"{name_of(content)} has {_dbh_text(content.dbh)}, {here}")
     return doubts
 
 

@@ -15,7 +15,7 @@ import { annotating, annotationOf, askForTree, byOther, draft, following, isSkip
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
 const AHEAD = 2; // trees whose stories are loaded ahead
-const TO_READ = 500; // [ms] before which nobody has read a question: a glance at a word takes 200 to 250 ms, and a decision follows
+const TO_READ = 500; // [ms] from a question to the earliest answer: two fixations of a reader, each about 250 ms (Rayner 1998)
 const KEPT = 4; // trees whose stories are loaded ahead or shown
 let shown = "", pictured = null; // version of the shown evidence; number of the tree of the camera picture
 const stories = new Map(); // of each subject the newest story: {index of the scan, promise}
@@ -33,12 +33,9 @@ export const card = (answers, hint) => el("article", { id: "review", class: "rev
     answers),
   hint);
 
-const dbhField = () =>
-  el("label", { id: "review-tape", class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, el("span", { id: "review-dbh-title" }), " ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" }));
-
 // What else is known of the tree.
 export const moreEvidence = () => el("section", { id: "review-more", class: "review-more", "aria-label": "Further evidence on the tree" },
-  dbhField(),
+  el("label", { id: "review-tape", class: "review-dbh", title: "A reference for the scores, which confirms the tree; the diameter in the map does not change" }, el("span", { id: "review-dbh-title" }), " ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", "aria-describedby": "review-dbh-error", onchange: takeDbh, onkeydown: endDbh }), el("span", { id: "review-dbh-error", class: "error" })),
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
 
@@ -120,8 +117,8 @@ function takeDbh({ target }) {
   }
 }
 
-// Returns whether a doubtful DBH is to be confirmed by a second Enter, which counts once the question can have been read.
-let askedAt = 0;
+// Returns whether a doubtful DBH must be confirmed by a second Enter, which counts from TO_READ after the question on.
+let askedAt = 0; // [ms] time of the question
 function isQuestioned(input, tree) {
   const dbh = checkedDbh(input), doubt = tree && dbh !== undefined ? typedDoubt(tree, dbh) : "";
   if (!doubt || dbh === annotationOf(tree)?.dbh_cm) return false;
@@ -152,7 +149,7 @@ function endDbh(event) {
   if (key === "d" && event.repeat) event.preventDefault(); // the key that has opened the field is still held down
   if (key !== "Enter" && key !== "Escape") return;
   event.preventDefault();
-  if (event.repeat) return; // a key that is held down answers once
+  if (event.repeat) return; // a held key answers once
   draft.error = "";
   if (key === "Escape") showDbh(tree);
   else if (checkedDbh(target) === undefined || isQuestioned(target, tree)) return;

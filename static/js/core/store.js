@@ -7,7 +7,7 @@ export const state = {
   path: [],          // [x, y, odometry x, odometry y] of each scan, the first two in the frame of the map
   truth: null,       // ground truth trees
   evaluation: null,  // the map scored against the ground truth
-  annotations: null, // {run, serial, problem, used, same_thing_m, doubt, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}], skipped: likewise, others: {class: [...]}, frame}
+  annotations: null, // {run, serial, problem, used, same_thing_m, doubt, trees: [{id, x, y, kind, dbh_cm, reach_m, who, dbh_who, by, at_s, version}], skipped: likewise, others: {class: [...]}, frame}
   parameters: null,  // {preset, set, revision, undo, redo, values, changed}
   sets: null,        // {sets: [{name, who, at_s}]}: saved sets of parameters
   holds: null,       // test of a tree by the filter of the table; null without a filter
